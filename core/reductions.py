@@ -13,13 +13,13 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
 from core.capture import Capture, Detection
 from core.checks import require, require_whole
-from core.kernels.parallel import PARALLEL, entering
+from core.kernels.parallel import COMPILED, on_threads
 from core.kernels.streams import pixel_key, uniform_at
 from core.pulse_groups import PulseGroups
 
@@ -240,8 +240,8 @@ def _of_pulses(
     """First photons of `n_pulses` of the pulses."""
     cube = np.empty(fired_in.shape, fired_in.dtype)
     if _are_few(fired_in):
-        with entering(cube.size):
-            _draw_pulses(fired_in, sent, n_pulses, np.uint64(seed), cube)
+        given = fired_in, sent, n_pulses, np.uint64(seed), cube
+        on_threads(_draw_pulses, len(cube), cube.size, *given)
         return cube
     require("n_pulses of the capture", sent, sent <= MOST_PULSES, f"{MOST_PULSES} or fewer")
     rng = np.random.default_rng(seed)
@@ -263,8 +263,7 @@ def _thinned(
     if not _are_few(cube):
         return np.random.default_rng(seed).binomial(cube, share).astype(cube.dtype)
     kept = np.empty(cube.shape, cube.dtype)
-    with entering(cube.size):
-        _keep_by_chance(cube, share, np.uint64(seed), kept)
+    on_threads(_keep_by_chance, len(cube), cube.size, cube, share, np.uint64(seed), kept)
     return kept
 
 
@@ -275,15 +274,15 @@ def _are_few(cube: NDArray[np.unsignedinteger]) -> bool:
 _BATCH = 64  # random numbers in a loop of their own, which vectorises
 
 
-@njit(**PARALLEL)
-def _draw_pulses(fired, sent, n_pulses, seed, drawn):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def _draw_pulses(first, end, fired, sent, n_pulses, seed, drawn):  # type: ignore[no-untyped-def]
     """Selection sampling of a pixel's detections, one by one (Fan, Muller & Rezucha 1962).
 
     A detection is drawn with probability ``left / (sent - draw)``. With the same random numbers a
     larger `n_pulses` never has fewer of them left, and so draws a superset.
     """
-    rows, cols, n_bins = fired.shape
-    for row in prange(rows):
+    _, cols, n_bins = fired.shape
+    for row in range(first, end):
         uniform = np.empty(_BATCH)
         for col in range(cols):
             key, draw, left = pixel_key(seed, row * cols + col), 0, float(n_pulses)
@@ -298,10 +297,10 @@ def _draw_pulses(fired, sent, n_pulses, seed, drawn):  # type: ignore[no-untyped
                 drawn[row, col, k] = before - left
 
 
-@njit(**PARALLEL)
-def _keep_by_chance(photons, share, seed, kept):  # type: ignore[no-untyped-def]
-    rows, cols, n_bins = photons.shape
-    for row in prange(rows):
+@njit(**COMPILED)
+def _keep_by_chance(first, end, photons, share, seed, kept):  # type: ignore[no-untyped-def]
+    _, cols, n_bins = photons.shape
+    for row in range(first, end):
         for col in range(cols):
             key, draw = pixel_key(seed, row * cols + col), 0
             for k in range(n_bins):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Floats, Flux, Pulse, pulses_sent
 from core.capture import Capture
 from core.checks import require
-from core.kernels.parallel import KERNEL_LOCK, entering
+from core.kernels.parallel import on_threads
 from core.kernels.simulate import (
     SHAPE_CODES,
     add_echo_photons,
@@ -100,8 +100,7 @@ def simulate(
         cube = groups.total.astype(cube.dtype)
     elif n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
         triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
-        with KERNEL_LOCK:
-            draw_pulses(triggered, 0, n_pulses, np.uint64(seed), cube)
+        _draw_pulses(triggered, 0, n_pulses, seed, cube)
     else:
         triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
         _draw_multinomial(triggered, n_pulses, seed, cube)
@@ -140,8 +139,7 @@ def _draw_groups(
         if shift != drawn_at:
             at = shifts_bins[shift : shift + 1]
             triggered, drawn_at = _triggered_at(scene, acquisition, flux, pulse, at), shift
-        with KERNEL_LOCK:
-            draw_pulses(triggered, begin, end, np.uint64(seed), counts[group])
+        _draw_pulses(triggered, begin, end, seed, counts[group])
         begin = end
     shape = (n_groups, *np.shape(scene.range_m), acquisition.n_bins)
     rate_hz = None if scene.motion is None else scene.motion.pulse_rate_hz
@@ -183,8 +181,7 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
     before = capture.acquisition.n_pulses
     share = None if before is None else before / n_pulses  # old pulses per new pulse
     cube = np.zeros_like(capture.cube)
-    with KERNEL_LOCK:
-        fire_once(capture.cube, n_pulses, np.uint64(seed), cube)
+    on_threads(fire_once, len(cube), cube.size, capture.cube, n_pulses, np.uint64(seed), cube)
     source = f"{capture.source}; reduced to the first photons of {n_pulses} pulses, seed {seed}"
     return replace(
         capture,
@@ -311,14 +308,21 @@ def add_echo(
     samples = np.cumsum((0.0, *pulse.samples))
     share = samples / (samples[-1] or 1.0)
     bin_taus = bin_width_s / pulse.tau_s
-    with entering(before.size * _EXPONENTIAL):
-        add_echo_photons(onset_bin, signal, bin_taus, SHAPE_CODES[pulse.shape], share, before)
+    given = onset_bin, signal, bin_taus, SHAPE_CODES[pulse.shape], share, before
+    on_threads(add_echo_photons, len(before), before.size * _EXPONENTIAL, *given)
 
 
 def to_probability(photons: Floats) -> None:
     """Replace the photons expected before each bin edge (pixel, edge) by the probability of any."""
-    with entering(photons.size * _EXPONENTIAL):
-        fill_probability(photons)
+    on_threads(fill_probability, len(photons), photons.size * _EXPONENTIAL, photons)
+
+
+def _draw_pulses(
+    triggered: Floats, begin: int, end: int, seed: int, cube: NDArray[np.unsignedinteger]
+) -> None:
+    n_pixels = len(cube)
+    given = triggered, begin, end, np.uint64(seed), cube
+    on_threads(draw_pulses, n_pixels, n_pixels * (end - begin), *given)
 
 
 def _draw_multinomial(

@@ -28,14 +28,13 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import Floats
 from core.checks import require
 from core.kernels.blocks import LANES, Blocks, lane_spread
-from core.kernels.parallel import KERNEL_LOCK, SERIAL_BELOW
+from core.kernels.parallel import on_threads
 from core.kernels.tracking import (
     ROUNDING_32,
     KernelSettings,
     Lanes,
     differentiate_rows,
-    track_parallel,
-    track_serial,
+    track_blocks,
 )
 from core.tracking_parameters import (
     CALM_M,
@@ -182,11 +181,7 @@ def track(
     score = np.empty_like(position)
     lanes = Lanes(sigma, blocks.largest, position, score)
     given = blocks.counts, lanes, (weight / top).astype(np.float32), settings
-    if blocks.counts.size > SERIAL_BELOW:
-        with KERNEL_LOCK:
-            track_parallel(*given)
-    else:
-        track_serial(*given)
+    on_threads(track_blocks, n_blocks, blocks.counts.size, *given)
     pixels = slice(blocks.n_pixels)
     return position.ravel()[pixels], score.ravel()[pixels] * top
 

@@ -9,15 +9,13 @@ from functools import partial
 import numpy as np
 
 from core.acquisition import Acquisition, Flux
-from core.capture import Capture
 from core.effects import Motion
 from core.estimators import ESTIMATORS, estimate
 from core.inference import fit_of
 from core.inspection import pixel_report
-from core.kernels.parallel import SERIAL_BELOW
 from core.scene import Scene, scenes
 from core.simulation import simulate
-from core.tracking import PRESETS, track, tracking_signals
+from core.tracking import PRESETS, tracking_signals
 
 
 def warm_up(progress: Callable[[int, int], None] = lambda done, of: None) -> None:
@@ -39,7 +37,7 @@ def warm_up(progress: Callable[[int, int], None] = lambda done, of: None) -> Non
         partial(fit_of, small),
         # `scipy.signal` takes a second to import.
         lambda: pixel_report(small, estimate(small, "tracking"), 0, 0),
-        partial(_track, small),
+        partial(tracking_signals, small.cube, PRESETS["recommended"]),
     ]
     progress(0, len(steps))
     for done, step in enumerate(steps, 1):
@@ -53,11 +51,3 @@ def _use_neighbours() -> None:
     estimate(simulate(wall, wall.acquisition, Flux(sbr=1.0)), "image_posterior")
     passing = replace(wall, motion=Motion(speed_m_per_s=20.0, pulse_rate_hz=20e3))
     estimate(simulate(passing, wall.acquisition, Flux(sbr=1.0), n_groups=8), "velocity")
-
-
-def _track(small: Capture) -> None:
-    """Compile tracking of large captures and the signals of all scales."""
-    pixels = SERIAL_BELOW // small.acquisition.n_bins + 1
-    large = Capture(np.zeros((pixels, 1, small.acquisition.n_bins), np.uint16), small.acquisition)
-    track(large.blocks, PRESETS["recommended"])
-    tracking_signals(small.cube, PRESETS["recommended"])

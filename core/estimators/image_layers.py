@@ -33,7 +33,7 @@ from core.estimators.image_posterior import peaks, planes, solved
 from core.inference.flux_model import Agreement
 from core.inference.posterior import TOLERANCE_BINS, States
 from core.inference.returns import FALSE_RETURN, echo_model, pixel_counts
-from core.kernels.parallel import entering
+from core.kernels.parallel import on_threads
 from core.kernels.returns import EchoModel, fill_further, fill_photons
 from core.trigger import draw_counts
 
@@ -200,16 +200,8 @@ def _evidence(
     known = np.where(is_there[other], signal[other], 0.0)
     levels = _LEVELS[layer, :, np.newaxis] * signal.sum(axis=0)
     log = np.empty(image.counts.shape, np.float32)
-    with entering(log.size * _BIN_COST):
-        fill_further(
-            image.counts,
-            image.model,
-            unexplained,
-            known[np.newaxis],
-            delay.reshape(1, -1),
-            levels,
-            log,
-        )
+    given = image.counts, image.model, unexplained, known[np.newaxis], delay.reshape(1, -1)
+    on_threads(fill_further, len(log), log.size * _BIN_COST, *given, levels, log)
     if layer == 1:
         log[~is_there[0]] = _IMPOSSIBLE  # no second surface without a first
     log -= np.float32(np.log(len(levels)))
@@ -222,16 +214,9 @@ def _local(image: _Image, fluxes: _Fluxes, delay: Floats, present: NDArray[np.bo
     photons, exposure = np.empty((2, 3, len(image.counts)))
     for _ in range(_FLUX_STEPS):
         here = np.where(present.reshape(2, -1), signal, 0.0)
-        with entering(image.counts.size * _BIN_COST):
-            fill_photons(
-                image.counts,
-                image.model,
-                np.ascontiguousarray(background),
-                here,
-                delay.reshape(2, -1),
-                photons,
-                exposure,
-            )
+        model, all_light = image.model, np.ascontiguousarray(background)
+        given = image.counts, model, all_light, here, delay.reshape(2, -1), photons, exposure
+        on_threads(fill_photons, len(image.counts), image.counts.size * _BIN_COST, *given)
         sums = [
             scipy.ndimage.uniform_filter(each.reshape(3, *image.shape), (0, _WINDOW, _WINDOW))
             for each in (photons, exposure)

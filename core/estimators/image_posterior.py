@@ -52,7 +52,7 @@ from core.inference.flux_model import Agreement, FluxModel
 from core.inference.posterior import States, mass_near, tolerance_probability
 from core.kernels.blocks import LANES
 from core.kernels.messages import fill_modes, fill_posterior
-from core.kernels.parallel import entering
+from core.kernels.parallel import on_threads
 from core.kernels.planes import fill_planes
 from core.parameters import Settings, parameter
 
@@ -171,11 +171,10 @@ def solved(
     per_row, per_col = level if slopes is None else slopes
     for k in range(0 if slopes is None else _ROUNDS - 1, _ROUNDS):
         link = links[min(k, 1)]
-        with entering(alone.surface.size):
-            fill_posterior(*alone, per_col, True, link, *half)
-            fill_posterior(*half, per_row, False, link, *both)
-            fill_posterior(*alone, per_row, False, link, *half)
-            fill_posterior(*half, per_col, True, link, *other)
+        _pass_messages(alone, per_col, True, link, half)
+        _pass_messages(half, per_row, False, link, both)
+        _pass_messages(alone, per_row, False, link, half)
+        _pass_messages(half, per_col, True, link, other)
         for one, another in zip(both, other, strict=True):
             np.multiply(np.add(one, another, out=one), np.float32(0.5), out=one)
         if k < _ROUNDS - 1:
@@ -183,11 +182,20 @@ def solved(
     return both
 
 
+def _pass_messages(
+    evidence: States, slope: NDArray[np.float32], along_rows: bool, link: Link, posterior: States
+) -> None:
+    """Fill `posterior` with that given the other pixels of the row, or of the column."""
+    n_lines = evidence.nothing.shape[0 if along_rows else 1]
+    given = *evidence, slope, along_rows, link, *posterior
+    on_threads(fill_posterior, n_lines, evidence.surface.size, *given)
+
+
 def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:
     """Likeliest delay of each pixel in bins and the probability of the bins around it."""
     delay, weight = np.empty((2, *posterior.shape[:2]))
-    with entering(posterior.size):
-        fill_modes(posterior.reshape(-1, posterior.shape[2]), delay.ravel(), weight.ravel())
+    given = posterior.reshape(-1, posterior.shape[2]), delay.ravel(), weight.ravel()
+    on_threads(fill_modes, delay.size, posterior.size, *given)
     return delay, weight
 
 
@@ -200,8 +208,7 @@ def planes(delay: Floats, weight: Floats) -> NDArray[np.float32]:
         for each in (delay, weight)
     ]
     plane = np.empty((3, rows, cols + beyond), np.float32)
-    with entering(delay.size * (2 * _HALF + 1) ** 2):
-        fill_planes(*wide, _HALF, plane)
+    on_threads(fill_planes, rows, delay.size * (2 * _HALF + 1) ** 2, *wide, _HALF, plane)
     return plane[:, :, :cols]
 
 

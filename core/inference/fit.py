@@ -34,7 +34,7 @@ from core.inference.likelihood import (
     prepare,
 )
 from core.kernels.echo_draws import UNIFORMS, redraw
-from core.kernels.parallel import entering
+from core.kernels.parallel import on_threads
 from core.kernels.streams import uniforms
 
 SIGNIFICANCE = 0.01
@@ -268,16 +268,18 @@ def _drawn(
     echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, steps)
     log_signal = np.log(np.where(level > 0, signal, 1.0))
     state = np.stack([delay_bin, log_signal, np.log(background / n_bins)], axis=1)
-    with entering(cube.size * UNIFORMS):  # a pass over the counts for every number drawn
-        redraw(
-            cube.astype(np.uint32),
-            capture.gated_pulses or 0,
-            streams,
-            echo,
-            first,
-            (flux.relative_background, *nodes_of(flux.relative_background)),
-            state,
-        )  # compiled for one type of counts
+    on_threads(
+        redraw,
+        len(cube),
+        cube.size * UNIFORMS,  # a pass over the counts for every number drawn
+        cube.astype(np.uint32),  # compiled for one type of counts
+        capture.gated_pulses or 0,
+        streams,
+        echo,
+        first,
+        (flux.relative_background, *nodes_of(flux.relative_background)),
+        state,
+    )
     return state[:, 0], np.exp(state[:, 1]), np.exp(state[:, 2])
 
 

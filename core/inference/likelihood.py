@@ -30,7 +30,7 @@ from core.inference.background import nodes_of
 from core.inference.flux_model import FluxModel
 from core.kernels.blocks import LANES, lane_counts
 from core.kernels.confidence import fill_densities, fill_evidence, fill_peaks
-from core.kernels.parallel import entering, in_parts
+from core.kernels.parallel import on_threads
 from core.kernels.posterior import fill_blocks
 from core.kernels.rates import fill_rates
 
@@ -198,7 +198,7 @@ class LikelihoodInput(NamedTuple):
     """Likewise, shape (node, bin)."""
     n_pixels: int
     work: int
-    """Work of a likelihood of the whole image, in counts for `core.kernels.parallel.entering`."""
+    """Work of a likelihood of the whole image, in counts for `core.kernels.parallel.on_threads`."""
 
 
 def prepare(
@@ -320,7 +320,7 @@ def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | None 
     evidence = np.empty((n_blocks, lanes, n_levels))
     depth = np.ones_like(prepared.depth) if depth is None else depth
     in_steps = np.ascontiguousarray(depth.reshape(-1, len(prepared.echo)).T)
-    in_parts(fill_evidence, n_blocks, prepared.work, prepared, in_steps, evidence)
+    on_threads(fill_evidence, n_blocks, prepared.work, prepared, in_steps, evidence)
     return evidence.reshape(-1, n_levels)[: prepared.n_pixels]
 
 
@@ -328,7 +328,7 @@ def level_densities(prepared: LikelihoodInput) -> NDArray[np.float32]:
     """Likelihood of each level and delay relative to the pixel's maximum (pixel, level, delay)."""
     n_levels, n_blocks, lanes = prepared.signal.shape
     density = np.empty((n_blocks, lanes, n_levels, prepared.depth.size), np.float32)
-    in_parts(fill_densities, n_blocks, prepared.work, prepared, density)
+    on_threads(fill_densities, n_blocks, prepared.work, prepared, density)
     return density.reshape(-1, *density.shape[2:])[: prepared.n_pixels]
 
 
@@ -367,7 +367,7 @@ def likeliest_delays(prepared: LikelihoodInput) -> tuple[NDArray[np.intp], Float
     """
     shape = prepared.signal.shape[1:]
     best, around = np.empty(shape, np.intp), np.empty((*shape, 3))
-    in_parts(fill_peaks, len(best), prepared.work, prepared, best, around)
+    on_threads(fill_peaks, len(best), prepared.work, prepared, best, around)
     return best, around
 
 
@@ -385,6 +385,5 @@ def _log_likelihoods(prepared: LikelihoodInput) -> Iterator[tuple[slice, NDArray
     for first in range(0, n_blocks, at_once):
         some = slice(first, min(first + at_once, n_blocks))
         log = np.empty((some.stop - first, n_levels, n_delays, lanes), np.float32)
-        with entering(prepared.work):
-            fill_blocks(first, prepared, log)
+        on_threads(fill_blocks, len(log), prepared.work, first, prepared, log)
         yield some, log

@@ -27,7 +27,7 @@ from core.inference.neighbours import box_sum
 from core.inference.posterior import vertex
 from core.kernels.blocks import lane_counts
 from core.kernels.motion import fill_moving_delays, fill_velocity_evidence
-from core.kernels.parallel import entering
+from core.kernels.parallel import on_threads
 from core.labels import Plane
 from core.pulse_groups import PulseGroups
 
@@ -149,8 +149,8 @@ def velocity_evidence(
     for pixels, prepared, counts in _parts(capture, groups, flux):
         lanes = counts.shape[3]
         found = np.empty((travel_bins.size, counts.shape[1], lanes))
-        with entering(counts.size * travel_bins.size):
-            fill_velocity_evidence(prepared, counts, _exposure(capture, groups), displaced, found)
+        given = prepared, counts, _exposure(capture, groups), displaced, found
+        on_threads(fill_velocity_evidence, counts.shape[1], counts.size * travel_bins.size, *given)
         evidence[pixels] = found.reshape(travel_bins.size, -1).T[: pixels.stop - pixels.start]
     return evidence.reshape(*capture.shape, travel_bins.size)
 
@@ -226,17 +226,19 @@ def moving_surfaces(
         velocity[:n_pixels] = row_of[pixels]
         best, around = np.empty((n_blocks, lanes), np.intp), np.empty((n_blocks, lanes, 3))
         found = np.empty((n_blocks, lanes, n_bins), np.float32)
-        with entering(counts.size):
-            fill_moving_delays(
-                prepared,
-                counts,
-                _exposure(capture, groups),
-                displaced,
-                velocity.reshape(n_blocks, lanes),
-                best,
-                around,
-                found,
-            )
+        on_threads(
+            fill_moving_delays,
+            n_blocks,
+            counts.size,
+            prepared,
+            counts,
+            _exposure(capture, groups),
+            displaced,
+            velocity.reshape(n_blocks, lanes),
+            best,
+            around,
+            found,
+        )
         at = vertex(best, STEPS_PER_BIN * n_bins - 1, np.moveaxis(around, 2, 0))
         delay[pixels] = at.ravel()[:n_pixels] / STEPS_PER_BIN
         score[pixels] = around[:, :, 1].ravel()[:n_pixels]

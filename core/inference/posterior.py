@@ -29,7 +29,7 @@ from core.inference.likelihood import (
 )
 from core.kernels.confidence import fill_masses, fill_states
 from core.kernels.messages import fill_window_masses
-from core.kernels.parallel import entering, in_parts
+from core.kernels.parallel import on_threads
 
 TOLERANCE_BINS = 3
 """Tolerance within which an estimate is right; it reproduces the paper's tables."""
@@ -83,7 +83,7 @@ def _masses(
     for pixels, prepared in prepared_groups(capture, flux, 1):
         some = slice(pixels.start // lanes, -(-pixels.stop // lanes))
         parts = TOLERANCE_BINS, first[some], within[some], surface[some]
-        in_parts(fill_masses, some.stop - some.start, prepared.work, prepared, *parts)
+        on_threads(fill_masses, some.stop - some.start, prepared.work, prepared, *parts)
     return within.reshape(-1, n_windows)[:n_pixels], surface.ravel()[:n_pixels]
 
 
@@ -112,7 +112,7 @@ def states_of(prepared: LikelihoodInput, none: float, least: float) -> States:
     surface = np.empty((n_blocks, lanes, prepared.depth.size), np.float32)
     nothing = np.empty((n_blocks, lanes), np.float32)
     given = none, np.float32(least), surface, nothing
-    in_parts(fill_states, n_blocks, prepared.work, prepared, *given)
+    on_threads(fill_states, n_blocks, prepared.work, prepared, *given)
     pixels = slice(prepared.n_pixels)
     return States(surface.reshape(-1, surface.shape[2])[pixels], nothing.ravel()[pixels])
 
@@ -188,8 +188,8 @@ def mass_near(by_bin: NDArray[np.float32], factor: int, delay_bin: Floats, n_bin
 
     def masses(first: NDArray[np.intp]) -> NDArray[np.float32]:
         window = np.empty((first.size, 2), np.float32)
-        with entering(2 * window.size * TOLERANCE_BINS):
-            fill_window_masses(merged, factor, TOLERANCE_BINS, first, window)
+        given = merged, factor, TOLERANCE_BINS, first, window
+        on_threads(fill_window_masses, len(window), 2 * window.size * TOLERANCE_BINS, *given)
         return window
 
     return probability_at(delay_bin, n_bins - 1, masses)

@@ -11,7 +11,7 @@ from core.capture import Capture
 from core.inference.flux_model import FluxModel
 from core.inference.posterior import same_echo_bins
 from core.kernels.blocks import LANES
-from core.kernels.parallel import entering
+from core.kernels.parallel import on_threads
 from core.kernels.refinement import refine_delays
 
 STEPS_PER_BIN = 4
@@ -90,20 +90,22 @@ def _moved(
     background = flux.typical_background / acquisition.n_bins * flux.relative_background[at]
     counts, delay = capture.blocks.counts, in_blocks(delay_bin)
     curvature = np.zeros_like(delay)
-    with entering(capture.cube.size):
-        refine_delays(
-            counts,
-            capture.gated_pulses or 0,
-            in_blocks(signal),
-            in_blocks(background),
-            echo,
-            steps_per_bin,
-            first,
-            reach,
-            FEWEST * (capture.pulse.sigma_s / width_s / SHARP_BINS) ** 2,
-            delay,
-            curvature,
-        )
+    on_threads(
+        refine_delays,
+        len(counts),
+        capture.cube.size,
+        counts,
+        capture.gated_pulses or 0,
+        in_blocks(signal),
+        in_blocks(background),
+        echo,
+        steps_per_bin,
+        first,
+        reach,
+        FEWEST * (capture.pulse.sigma_s / width_s / SHARP_BINS) ** 2,
+        delay,
+        curvature,
+    )
     with np.errstate(divide="ignore"):
         spread = 1 / (steps_per_bin * np.sqrt(np.abs(curvature)))
     delay, spread = (x.ravel()[:n_pixels].reshape(delay_bin.shape) for x in (delay, spread))

@@ -32,7 +32,7 @@ from core.inference.flux import flux_prior_of
 from core.inference.further_echo import further_echo_log_odds, probability_within
 from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import TOLERANCE_BINS, posterior_of
-from core.kernels.parallel import entering
+from core.kernels.parallel import on_threads
 from core.kernels.returns import EchoModel, fill_returns
 from core.labels import Plane
 from core.trigger import draw_counts
@@ -320,8 +320,8 @@ def fitted_echoes(
     values, gain = np.zeros((len(flat), 1 + 2 * most)), np.zeros((len(flat), most))
     number = np.zeros(len(flat), np.intp)
     model = echo_model(capture, background)
-    with entering(flat.size * _BIN_COST):
-        fill_returns(flat, model, float(least), values, gain, number)
+    given = flat, model, float(least), values, gain, number
+    on_threads(fill_returns, len(flat), flat.size * _BIN_COST, *given)
     echo, many = np.arange(most), number[:, np.newaxis]
     there = echo < many
     signal, delay = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
@@ -13,7 +13,7 @@ from core.inference.fit import fit_p_values
 from core.inference.posterior import TOLERANCE_BINS, posterior_of
 from core.inference.returns import MOST_RETURNS, fitted_echoes, least_gain
 from core.inspection.surfaces import LIKELY
-from core.kernels.parallel import PARALLEL, entering
+from core.kernels.parallel import COMPILED, on_threads
 
 
 @cached_per_capture
@@ -57,8 +57,8 @@ def sbr(capture: Capture) -> Floats:
     begin = np.clip(likeliest(capture)[0] + first, 0, n_bins)
     end = np.clip(begin + echo.size, 0, n_bins)
     before, inside = np.empty((2, *capture.shape), np.int64)
-    with entering(capture.cube.size):
-        _count(capture.cube, begin, end, before, inside)
+    given = capture.cube, begin, end, before, inside
+    on_threads(_count, capture.shape[0], capture.cube.size, *given)
     total = capture.counts
     if n_pulses is None:
         echo_photons, all_photons = inside.astype(float), total.astype(float)
@@ -84,10 +84,10 @@ def number_of_returns(capture: Capture) -> Floats:
     return np.where(has_any, n_echoes.reshape(capture.shape), 0).astype(float)
 
 
-@njit(**PARALLEL)
-def _count(cube, begin, end, before, inside):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def _count(first, last, cube, begin, end, before, inside):  # type: ignore[no-untyped-def]
     """Count detections of each pixel before the bin `begin`, and from there to `end`."""
-    for row in prange(cube.shape[0]):
+    for row in range(first, last):
         for col in range(cube.shape[1]):
             total = 0
             for k in range(begin[row, col]):

@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.parallel import COMPILED, PARALLEL, entering
+from core.kernels.parallel import COMPILED, on_threads
 
 LANES = 64
 """Pixels processed together: four vectors of sixteen float32."""
@@ -58,8 +58,7 @@ def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.uns
     filled, left = divmod(pixels.shape[0], lanes)
     counts = np.empty((filled + (left > 0), n_bins, lanes), cube.dtype)
     if lanes == LANES:
-        with entering(pixels.size):
-            _lay_out(pixels, counts[:filled])
+        on_threads(_lay_out, filled, pixels.size, pixels, counts)
     else:
         counts[:filled] = pixels[: filled * lanes].reshape(-1, lanes, n_bins).transpose(0, 2, 1)
     counts[filled:] = 0
@@ -67,10 +66,10 @@ def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.uns
     return counts
 
 
-@njit(**PARALLEL)
-def _lay_out(pixels, counts):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def _lay_out(first_block, end_block, pixels, counts):  # type: ignore[no-untyped-def]
     """Transpose pixels (pixel, bin) into full blocks."""
-    for b in prange(counts.shape[0]):
+    for b in range(first_block, end_block):
         # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
         for first in range(0, LANES, PIXELS_AT_ONCE):
             for k in range(counts.shape[1]):
@@ -88,16 +87,15 @@ def lane_spread(
     shape = len(counts), LANES
     largest, sigma = np.zeros(shape, counts.dtype), np.zeros(shape)
     if n_bins > 0:
-        with entering(counts.size):
-            _fill_spread(counts, n_bins, largest, sigma)
+        on_threads(_fill_spread, len(counts), counts.size, counts, n_bins, largest, sigma)
     return largest, sigma
 
 
-@njit(**PARALLEL)
-def _fill_spread(counts, n_bins, largest, sigma):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def _fill_spread(first, end, counts, n_bins, largest, sigma):  # type: ignore[no-untyped-def]
     """Fill the largest count and the standard deviation, see `lane_spread`."""
     grouped = n_bins - n_bins % _BINS_AT_ONCE
-    for b in prange(counts.shape[0]):
+    for b in range(first, end):
         block, top = counts[b], largest[b]
         total, squares = np.zeros(LANES, np.int64), np.zeros(LANES)
         for k in range(0, grouped, _BINS_AT_ONCE):

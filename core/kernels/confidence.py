@@ -3,7 +3,8 @@
 The likelihood of a block of pixels stays in the cache. Signal levels are added one by one, in units
 of the largest term so far (Milakov & Gimelshein 2018).
 
-Kernels of an image process the blocks from `first` to `end`, see `core.kernels.parallel.in_parts`.
+Kernels of an image process the blocks from `first` to `end`, see
+`core.kernels.parallel.on_threads`.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def fill_evidence(first, end, prepared, depth, evidence):  # type: ignore[no-unt
         _fill_evidence(b, prepared, depth, evidence[b])
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_evidence(b, prepared, depth, evidence):  # type: ignore[no-untyped-def]
     """Fill `fill_evidence` of a block, (lane, level)."""
     n_steps, n_bins = depth.shape
@@ -84,7 +85,7 @@ def fill_densities(first, end, prepared, density):  # type: ignore[no-untyped-de
         _fill_densities(b, prepared, density[b])
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_densities(b, prepared, density):  # type: ignore[no-untyped-def]
     """Fill `fill_densities` of a block, (lane, level, delay)."""
     lanes, n_levels, n_delays = density.shape
@@ -165,7 +166,7 @@ def fill_peaks(first, end, prepared, best, around):  # type: ignore[no-untyped-d
         _fill_peaks(b, prepared, best[b], around[b])
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_peaks(b, prepared, best, around):  # type: ignore[no-untyped-def]
     """Fill `fill_peaks` of a block, (lane,) and (lane, 3)."""
     lanes = best.size
@@ -220,7 +221,7 @@ def fill_masses(first, end, prepared, half, begin, mass, surface):  # type: igno
         _fill_masses(b, prepared, half, begin[b], mass[b], surface[b])
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_masses(b, prepared, half, begin, mass, surface):  # type: ignore[no-untyped-def]
     """Fill `fill_masses` of a block, (lane, window) and (lane,)."""
     n_delays, (lanes, n_windows) = prepared.depth.size, mass.shape
@@ -259,7 +260,7 @@ def fill_states(first, end, prepared, none, least, surface, nothing):  # type: i
         _fill_states(b, prepared, none, least, surface[b], nothing[b])
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_states(b, prepared, none, least, surface, nothing):  # type: ignore[no-untyped-def]
     """Fill `fill_states` of a block, (lane, delay) and (lane,)."""
     lanes, n_delays = surface.shape

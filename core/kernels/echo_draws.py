@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 from core.kernels.streams import pixel_key, uniform_at
 
 _VALUES = 8
@@ -77,15 +77,17 @@ def _chosen(log_weight, uniform):  # type: ignore[no-untyped-def]
     return log_weight.argmax()
 
 
-@njit(**PARALLEL)
-def redraw(counts, n_pulses, pixels, echo, first_tap, background, state):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def redraw(  # type: ignore[no-untyped-def]
+    first, end, counts, n_pulses, pixels, echo, first_tap, background, state
+):
     """Replace the states (pixel, 3) by other draws: delay, log signal, and log background per bin.
 
     A delay of NaN, no echo, remains. `counts` is (pixel, bin), `pixels` the numbers of their random
     streams, and `n_pulses` 0 if unknown. `background` holds the shape (bin,) and its nodes.
     """
     shape, node, node_weight = background
-    for pixel in prange(len(counts)):
+    for pixel in range(first, end):
         key, draw, scale = pixel_key(np.uint64(0), pixels[pixel]), 0, 1.0
         fired = counts[pixel].astype(np.float64)
         unfired = n_pulses - np.cumsum(fired) if n_pulses > 0 else np.ones(fired.size)

@@ -15,9 +15,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from core.kernels.parallel import COMPILED, PARALLEL, SUMMING
+from core.kernels.parallel import COMPILED, SUMMING
 
 MOST_TAPS = 33
 """Taps of the kernel K, at most."""
@@ -78,11 +78,13 @@ def _multiply(evidence, message, posterior):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(**PARALLEL)
-def fill_posterior(evidence, nothing, slope, along_rows, link, posterior, posterior_nothing):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_posterior(  # type: ignore[no-untyped-def]
+    first, end, evidence, nothing, slope, along_rows, link, posterior, posterior_nothing
+):
     """Fill the posteriors of the pixels of each row (or column), given the other pixels of it.
 
-    Exact, by messages forward and backward.
+    Exact, by messages forward and backward. Of the rows (or columns) from `first` to `end`.
 
     Parameters
     ----------
@@ -99,11 +101,10 @@ def fill_posterior(evidence, nothing, slope, along_rows, link, posterior, poster
         Together 1 in each pixel.
     """
     rows, cols, n_bins = evidence.shape
-    n_lines, length = (rows, cols) if along_rows else (cols, rows)
-    line_step, step = (cols, 1) if along_rows else (1, cols)
+    length, line_step, step = (cols, cols, 1) if along_rows else (rows, 1, cols)
     seen, found = evidence.reshape(-1, n_bins), posterior.reshape(-1, n_bins)
     dark, found_dark, slopes = nothing.reshape(-1), posterior_nothing.reshape(-1), slope.reshape(-1)
-    for line in prange(n_lines):
+    for line in range(first, end):
         weights = np.zeros(n_bins + 2 * _MARGIN, np.float32)
         inner = weights[_MARGIN : _MARGIN + n_bins]
         message, sums = np.ones(n_bins, np.float32), np.empty(n_bins, np.float32)
@@ -131,15 +132,15 @@ def fill_posterior(evidence, nothing, slope, along_rows, link, posterior, poster
             on_nothing = _pass_on(weights, h, total, -slopes[at], link, taps, sums, message)
 
 
-@njit(**PARALLEL)
-def fill_modes(posterior, delay, weight):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_modes(first, end, posterior, delay, weight):  # type: ignore[no-untyped-def]
     """Fill the likeliest `delay` of each pixel in bins, refined by a parabola, and its `weight`.
 
     The weight is the probability of a bin or two around it. `posterior` is of shape (pixel, bin),
     `delay` and `weight` (pixel,).
     """
-    n_pixels, n_bins = posterior.shape
-    for i in prange(n_pixels):
+    n_bins = posterior.shape[1]
+    for i in range(first, end):
         here = posterior[i]
         best = 0
         for d in range(1, n_bins):
@@ -158,18 +159,18 @@ def fill_modes(posterior, delay, weight):  # type: ignore[no-untyped-def]
         weight[i] = mass
 
 
-@njit(**PARALLEL)
-def fill_window_masses(posterior, factor, half, first, window):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_window_masses(first, end, posterior, factor, half, begin, window):  # type: ignore[no-untyped-def]
     """Fill `window` with the mass of `half` bins on either side of the beginning of some bins.
 
     `posterior` (pixel, merged bin) is of `factor` bins each, which share it alike. The bins of a
-    pixel are those from `first` (pixel,), as many as `window` (pixel, n) has columns.
+    pixel are those from `begin` (pixel,), as many as `window` (pixel, n) has columns.
     """
     n_bins = posterior.shape[1] * factor
-    for i in prange(window.shape[0]):
+    for i in range(first, end):
         for n in range(window.shape[1]):
             mass = np.float32(0.0)
-            begin = first[i] + n - half
-            for d in range(max(begin, 0), min(begin + 2 * half, n_bins)):
+            at = begin[i] + n - half
+            for d in range(max(at, 0), min(at + 2 * half, n_bins)):
                 mass += posterior[i, d // factor] / np.float32(factor)
             window[i, n] = mass

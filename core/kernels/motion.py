@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from core.kernels.blocks import lane_rows
 from core.kernels.confidence import add_level, fill_highest
 from core.kernels.elementary import exp32
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 from core.kernels.posterior import correlate, counts_of, fill_flat, fill_log_gain
 
 
@@ -112,18 +112,18 @@ def _fill_ratio(first, gain, loss, fired, unfired, ratio):  # type: ignore[no-un
             correlate(loss[at], unfired[phase], tap, ratio[step])
 
 
-@njit(**PARALLEL)
-def fill_velocity_evidence(prepared, counts, n_pulses, displaced, evidence):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_velocity_evidence(first, end, prepared, counts, n_pulses, displaced, evidence):  # type: ignore[no-untyped-def]
     """Fill the log likelihood ratio of each velocity to no echo, (velocity, block, lane).
 
     Averaged over a delay in each bin in the middle of the recording, and over the levels. `counts`
     is of shape (group, block, bin, lane), `n_pulses` (group,), and `displaced` (velocity, group)
     are the displacements in steps.
     """
-    n_velocities, n_blocks, lanes = evidence.shape
+    n_velocities, _, lanes = evidence.shape
     n_groups, n_bins, n_nodes = len(counts), counts.shape[2], len(prepared.node)
     n_levels = len(prepared.signal) - 1
-    for b in prange(n_blocks):
+    for b in range(first, end):
         fired, unfired, met, left = _groups_of(b, prepared, counts, n_pulses)
         gain, loss = _taps_of(b, prepared, lanes)
         ratio = lane_rows(n_bins, lanes).reshape(1, n_bins, lanes)
@@ -155,8 +155,10 @@ def fill_velocity_evidence(prepared, counts, n_pulses, displaced, evidence):  # 
                     evidence[v, b, i] = most + math.log1p(math.exp(least - most))
 
 
-@njit(**PARALLEL)
-def fill_moving_delays(prepared, counts, n_pulses, displaced, velocity, best, around, surface):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_moving_delays(  # type: ignore[no-untyped-def]
+    first, end, prepared, counts, n_pulses, displaced, velocity, best, around, surface
+):
     """Fill the likeliest delay of each pixel for its velocity, in steps, (block, lane).
 
     Also the logarithms of the likelihood ratios to no echo before, at and after it, (block, lane,
@@ -165,11 +167,11 @@ def fill_moving_delays(prepared, counts, n_pulses, displaced, velocity, best, ar
     `velocity` (block, lane) are rows of `displaced` (velocity, group); other arguments are those of
     `fill_velocity_evidence`.
     """
-    n_blocks, lanes, n_bins = surface.shape
+    _, lanes, n_bins = surface.shape
     n_groups, n_nodes = len(counts), len(prepared.node)
     n_levels, n_steps = len(prepared.signal) - 1, len(prepared.echo)
     n_delays, none = n_steps * n_bins, prepared.log_share[0]
-    for b in prange(n_blocks):
+    for b in range(first, end):
         fired, unfired, met, left = _groups_of(b, prepared, counts, n_pulses)
         gain, loss = _taps_of(b, prepared, lanes)
         ratio = lane_rows(n_levels * n_delays, lanes).reshape(n_levels, n_steps, n_bins, lanes)

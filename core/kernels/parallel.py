@@ -1,13 +1,11 @@
-"""Compilation options of kernels, the lock of parallel ones, and threads for others."""
+"""Compilation options of kernels, and their threads."""
 
 from __future__ import annotations
 
 import logging
 import os
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -28,7 +26,7 @@ def can_cache() -> bool:
     except RuntimeError:
         log.warning(
             "No folder for compiled kernels is writable, so that each start compiles them again "
-            "(about 20 s): set NUMBA_CACHE_DIR to a writable folder."
+            "(minutes): set NUMBA_CACHE_DIR to a writable folder."
         )
         return False
     return True
@@ -41,45 +39,27 @@ COMPILED: dict[str, Any] = {
     "fastmath": {"contract"},
     "error_model": "numpy",  # a division by zero gives infinity or NaN, as in numpy
 }
-PARALLEL: dict[str, Any] = {**COMPILED, "parallel": True}
 # Sums in any order can be vectorised.
 SUMMING: dict[str, Any] = {**COMPILED, "fastmath": {"contract", "reassoc"}}
-
-# Without OpenMP, numba's threading layer aborts the process if two Python threads run parallel
-# kernels at once.
-KERNEL_LOCK = threading.Lock()
 
 # Counts in a cube up to which threads cost more than they save.
 SERIAL_BELOW = 2_000_000
 
 
-@contextmanager
-def entering(n_counts: int) -> Iterator[None]:
-    """Hold the lock of parallel kernels; use one thread for small work.
-
-    On a busy machine, synchronising threads takes longer than small work itself.
-    """
-    with KERNEL_LOCK:
-        threads = numba.get_num_threads()
-        numba.set_num_threads(threads if n_counts > SERIAL_BELOW else 1)
-        try:
-            yield
-        finally:
-            numba.set_num_threads(threads)
-
-
-def in_parts(kernel: Callable[..., None], n_blocks: int, work: int, *arguments: Any) -> None:
+def on_threads(kernel: Callable[..., None], n_blocks: int, work: int, *arguments: Any) -> None:
     """Call ``kernel(first, end, *arguments)`` for all blocks, in parts on threads if work is large.
 
-    For kernels of much code, which numba compiles three times with ``parallel=True``.
+    Numba's own threads (``parallel=True``) would compile a kernel three times, and abort the
+    process if two Python threads ran such kernels at once.
 
     Parameters
     ----------
     kernel : callable
-        Compiled with `COMPILED`.
+        Compiled with `COMPILED`; blocks may be rows, columns or pixels.
     n_blocks : int
     work : int
-        As for `entering`.
+        About as much as a pass over so many counts: up to `SERIAL_BELOW`, threads would cost more
+        than they save.
     *arguments
     """
     n_parts = min(numba.get_num_threads(), n_blocks) if work > SERIAL_BELOW else 1

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from core.kernels.blocks import LANES, lane_rows
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 
 SPREADS_BINS = (4.0, 3.0, 2.0, 1.5)
 """Distances from the plane at which the weight of a pixel is a quarter, one per round."""
@@ -54,8 +54,8 @@ def _solve(sums, plane):  # type: ignore[no-untyped-def]
         plane[2 * LANES + i] += right
 
 
-@njit(**PARALLEL)
-def fill_planes(delay, weight, half, plane):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_planes(first_row, end_row, delay, weight, half, plane):  # type: ignore[no-untyped-def]
     """Fill `plane` (3, row, col): delay in the pixel, and its change from row to row, col to col.
 
     Weighted least squares over 2 half + 1 rows and columns. The weights are those given times
@@ -63,8 +63,8 @@ def fill_planes(delay, weight, half, plane):  # type: ignore[no-untyped-def]
     one. `delay` and `weight` are float32 with a margin of `half` pixels, whose weight is 0; `col`
     is a multiple of LANES.
     """
-    _, rows, cols = plane.shape
-    for row in prange(rows):
+    cols = plane.shape[2]
+    for row in range(first_row, end_row):
         here, sums = lane_rows(3), lane_rows(_N_SUMS)
         for first in range(0, cols, LANES):
             here[:LANES] = delay[row + half, half + first : half + first + LANES]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from core.kernels.blocks import LANES, lane_rows
 from core.kernels.elementary import log1p32
-from core.kernels.parallel import COMPILED, PARALLEL, SUMMING
+from core.kernels.parallel import COMPILED, SUMMING
 
 _STEPS = 100  # of expectation and maximisation
 _DARK_PIXELS = 0.1  # additional pixels without an echo, so that their share is never 0
@@ -302,7 +302,7 @@ def fill_flat(b, level, prepared, fired, unfired, flat):  # type: ignore[no-unty
             flat[i] += fired[node, i] * gained
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
     """Fill log likelihood ratios of each level and delay to no echo, (level, delay, lane)."""
     n_levels, n_delays, lanes = log.shape
@@ -318,8 +318,8 @@ def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
                 log[level, d, i] = ratio[d % n_steps, d // n_steps, i] + np.float32(flat[i])
 
 
-@njit(**PARALLEL)
-def fill_blocks(first, prepared, log):  # type: ignore[no-untyped-def]
-    """Fill log likelihood ratios of the blocks from `first`, (block, level, delay, lane)."""
-    for b in prange(log.shape[0]):
-        _fill_block(first + b, prepared, log[b])
+@njit(**COMPILED)
+def fill_blocks(first, end, skipped, prepared, log):  # type: ignore[no-untyped-def]
+    """Fill log likelihood ratios of blocks after `skipped` ones, (block, level, delay, lane)."""
+    for b in range(first, end):
+        _fill_block(skipped + b, prepared, log[b])

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 
 FITTING_ROUNDS = 2  # of the fit of a signal and its delay
 _NEWTON_STEPS = 6
@@ -109,9 +109,21 @@ def _highest(score, begin, end):  # type: ignore[no-untyped-def]
     return best + min(max(0.5 * (left - right) / curvature, -0.5), 0.5), curvature
 
 
-@njit(**PARALLEL)
+@njit(**COMPILED)
 def refine_delays(  # type: ignore[no-untyped-def]
-    blocks, n_pulses, signal, background, echo, steps, first_tap, reach, fewest, delay, curvature
+    first_block,
+    end_block,
+    blocks,
+    n_pulses,
+    signal,
+    background,
+    echo,
+    steps,
+    first_tap,
+    reach,
+    fewest,
+    delay,
+    curvature,
 ):
     """Move each delay (block, lane) to the maximum of ``T(d)`` less than `reach` bins from it.
 
@@ -127,7 +139,7 @@ def refine_delays(  # type: ignore[no-untyped-def]
     exceed their noise as much as `fewest` counts without background do; otherwise the delay
     remains.
     """
-    for b in prange(len(blocks)):
+    for b in range(first_block, end_block):
         _refine_block(
             blocks[b],
             n_pulses,
@@ -143,7 +155,7 @@ def refine_delays(  # type: ignore[no-untyped-def]
         )
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _refine_block(  # type: ignore[no-untyped-def]
     counts, n_pulses, signal, background, echo, steps, first_tap, reach, fewest, delay, curvature
 ):

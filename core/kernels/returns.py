@@ -20,11 +20,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from core.kernels.elementary import exp32, log1p32
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 
 _LEAST = 1e-9  # photons per pulse, or per pixel, of background or signal
 _STEPS = 25  # of a fit
@@ -337,7 +337,7 @@ def _pixel(counts, model):  # type: ignore[no-untyped-def]
     return Pixel(n, unfired, fired[:n_fired], n_photons, exposure)
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fit_returns(counts, model, least_gain, most, values, gains):  # type: ignore[no-untyped-def]
     """Fit echoes to one pixel, see `fill_returns`; return their number."""
     pixel = _pixel(counts, model)
@@ -356,8 +356,8 @@ def _fit_returns(counts, model, least_gain, most, values, gains):  # type: ignor
     return most
 
 
-@njit(**PARALLEL)
-def fill_returns(counts, model, least_gain, values, gains, number):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_returns(first, end, counts, model, least_gain, values, gains, number):  # type: ignore[no-untyped-def]
     """Fit echoes to each pixel, one more as long as it raises ℓ by more than `least_gain`.
 
     Parameters
@@ -373,7 +373,7 @@ def fill_returns(counts, model, least_gain, values, gains, number):  # type: ign
     number : ndarray, shape (pixel,)
         Filled with the number of echoes.
     """
-    for i in prange(len(counts)):
+    for i in range(first, end):
         number[i] = _fit_returns(counts[i], model, least_gain, gains.shape[1], values[i], gains[i])
 
 
@@ -406,7 +406,7 @@ def _add_logarithms(one, log):  # type: ignore[no-untyped-def]
         log[d] = high + log1p32(exp32(low - high))
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_further(i, counts, model, background, signal, delay, levels, log):  # type: ignore[no-untyped-def]
     """Fill `log` (bin,) of one pixel, see `fill_further`."""
     n_bins, n_taps, middle = counts.size, model.echo.shape[1], (model.echo.shape[0] - 1) // 2
@@ -449,8 +449,8 @@ def _fill_further(i, counts, model, background, signal, delay, levels, log):  # 
         _add_logarithms(one, log)
 
 
-@njit(**PARALLEL)
-def fill_further(counts, model, background, signal, delay, levels, log):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_further(first, end, counts, model, background, signal, delay, levels, log):  # type: ignore[no-untyped-def]
     """Fill the log likelihood ratio of one more echo in the middle of each bin to none.
 
     Its photons are taken from the background; the ratio is the sum over its `levels`.
@@ -468,14 +468,14 @@ def fill_further(counts, model, background, signal, delay, levels, log):  # type
     log : ndarray of float32, shape (pixel, bin)
     """
     none = np.float32(-1e30)
-    for i in prange(len(counts)):
+    for i in range(first, end):
         for k in range(log.shape[1]):
             log[i, k] = none
         _fill_further(i, counts[i], model, background, signal, delay, levels, log[i])
 
 
-@njit(**PARALLEL)
-def fill_photons(counts, model, background, signal, delay, photons, exposure):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_photons(first, end, counts, model, background, signal, delay, photons, exposure):  # type: ignore[no-untyped-def]
     """Fill expected photons of the background and of each echo, and the exposure to each.
 
     Parameters
@@ -485,11 +485,11 @@ def fill_photons(counts, model, background, signal, delay, photons, exposure):  
     photons, exposure : ndarray, shape (1 + echo, pixel)
         The ratio of their sums is the next flux of expectation and maximisation.
     """
-    for i in prange(len(counts)):
+    for i in range(first, end):
         _fill_photons(i, counts[i], model, background, signal, delay, photons, exposure)
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _fill_photons(i, counts, model, background, signal, delay, photons, exposure):  # type: ignore[no-untyped-def]
     """As `fill_photons`, for pixel i."""
     pixel, rate, n_taps = _pixel(counts, model), np.empty(counts.size), model.echo.shape[1]

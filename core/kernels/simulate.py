@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 from core.kernels.streams import pixel_key, uniform_at
 
 _GAMMA, _GAUSSIAN, _MEASURED = range(3)
@@ -31,11 +31,11 @@ def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
     return share[below] + (t - below) * (share[below + 1] - share[below])
 
 
-@njit(**PARALLEL)
-def add_echo_photons(onset_bin, signal, bin_taus, shape, share, before):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def add_echo_photons(first, end, onset_bin, signal, bin_taus, shape, share, before):  # type: ignore[no-untyped-def]
     """Add the expected photons of each pixel's echo before each bin edge to `before`."""
-    n_pixels, n_edges = before.shape
-    for pixel in prange(n_pixels):
+    n_edges = before.shape[1]
+    for pixel in range(first, end):
         onset = onset_bin[pixel]
         if not math.isfinite(onset):
             continue
@@ -47,16 +47,15 @@ def add_echo_photons(onset_bin, signal, bin_taus, shape, share, before):  # type
             before[pixel, edge] += signal[pixel] * (arrived - early)
 
 
-@njit(**PARALLEL)
-def fill_probability(photons):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_probability(first, end, photons):  # type: ignore[no-untyped-def]
     """Replace expected photons (pixel, edge) by the probability of any."""
-    n_pixels, n_edges = photons.shape
-    for pixel in prange(n_pixels):
-        for edge in range(n_edges):
+    for pixel in range(first, end):
+        for edge in range(photons.shape[1]):
             photons[pixel, edge] = -math.expm1(-photons[pixel, edge])
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _draw_pixel(fired_by, begin, end, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
     """Add the first-photon draws of the pulses from `begin` to before `end` to `counts`.
 
@@ -88,26 +87,27 @@ def _draw_pixel(fired_by, begin, end, key, guide, uniform, counts):  # type: ign
         done += batch
 
 
-@njit(**PARALLEL)
-def draw_pulses(triggered, begin, end, seed, cube):  # type: ignore[no-untyped-def]
-    """Add first-photon counts (pixel, bin) of the pulses from `begin` to before `end`."""
-    n_pixels, n_bins = cube.shape
-    for pixel in prange(n_pixels):
+@njit(**COMPILED)
+def draw_pulses(first, end, triggered, first_pulse, end_pulse, seed, cube):  # type: ignore[no-untyped-def]
+    """Add first-photon counts (pixel, bin) of pulses, up to before `end_pulse`."""
+    n_bins = cube.shape[1]
+    for pixel in range(first, end):
         fired_by = np.full(n_bins + 1, 2.0)
         fired_by[:n_bins] = triggered[pixel, 1:]
         guide = np.empty(_CELLS + 1, np.uint32)
         uniform = np.empty(64)
         counts = np.zeros(n_bins + 1, np.int64)
-        _draw_pixel(fired_by, begin, end, pixel_key(seed, pixel), guide, uniform, counts)
+        key = pixel_key(seed, pixel)
+        _draw_pixel(fired_by, first_pulse, end_pulse, key, guide, uniform, counts)
         for k in range(n_bins):
             cube[pixel, k] += counts[k]
 
 
-@njit(**PARALLEL)
-def fire_once(photons, n_pulses, seed, fired):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fire_once(first, end, photons, n_pulses, seed, fired):  # type: ignore[no-untyped-def]
     """Assign photons to pulses at random and keep the first photon of each pulse."""
-    rows, cols, n_bins = photons.shape
-    for row in prange(rows):
+    _, cols, n_bins = photons.shape
+    for row in range(first, end):
         for col in range(cols):
             key = pixel_key(seed, row * cols + col)
             armed, draw = n_pulses, 0

@@ -17,11 +17,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from core.kernels.blocks import LANES, lane_rows
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 
 # Residuals below this share of the largest count are rounding errors.
 ROUNDING_32 = float(16 * np.finfo(np.float32).eps)
@@ -106,7 +106,7 @@ def _follow(x1, x2, s, r, per_m):  # type: ignore[no-untyped-def]
     return x1 + x2 * per_m, x2 - a * per_m
 
 
-@njit(**COMPILED)
+@njit(**COMPILED, inline="always")
 def _track_block(b, blocks, lanes, weight, settings, row):  # type: ignore[no-untyped-def]
     """Fill position and score of the pixels of block `b`, by the recursion of the module.
 
@@ -171,15 +171,8 @@ def _prepare_rows(counts, sigma, largest, settings, row):  # type: ignore[no-unt
 
 
 @njit(**COMPILED)
-def track_serial(blocks, lanes, weight, settings):  # type: ignore[no-untyped-def]
+def track_blocks(first, end, blocks, lanes, weight, settings):  # type: ignore[no-untyped-def]
     """Fill `lanes` with the position and score of every pixel, block by block."""
     row = lane_rows(_ROWS)
-    for b in range(blocks.shape[0]):
+    for b in range(first, end):
         _track_block(b, blocks, lanes, weight, settings, row)
-
-
-@njit(**PARALLEL)
-def track_parallel(blocks, lanes, weight, settings):  # type: ignore[no-untyped-def]
-    """As `track_serial`, on all threads."""
-    for b in prange(blocks.shape[0]):
-        _track_block(b, blocks, lanes, weight, settings, lane_rows(_ROWS))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from core import tracking
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
@@ -266,7 +265,6 @@ def test_estimates_do_not_depend_on_threads(
 ) -> None:
     capture = simulated(size=14)
     serial = estimate(capture, *case)
-    monkeypatch.setattr(tracking, "SERIAL_BELOW", 0)
     monkeypatch.setattr("core.kernels.parallel.SERIAL_BELOW", 0)
     numba.set_num_threads(n_threads)
     assert_same(estimate(capture, *case), serial)

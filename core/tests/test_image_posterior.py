@@ -47,7 +47,7 @@ def test_messages_give_the_exact_posterior_of_a_row(slope: float, along_rows: bo
     dark = weights[:, n_bins].reshape(shape).copy()
     found, found_dark = np.empty_like(surface), np.empty_like(dark)
     slopes, of = np.full(shape, slope, np.float32), link(n_bins, nothing)
-    fill_posterior(surface, dark, slopes, along_rows, of, found, found_dark)
+    fill_posterior(0, 1, surface, dark, slopes, along_rows, of, found, found_dark)
     expected = posterior_of_chain(weights.astype(float), ALIKE, SCALE, slope, nothing)
     both = np.concatenate([found.reshape(4, n_bins), found_dark.reshape(4, 1)], axis=1)
     np.testing.assert_allclose(both, expected, rtol=1e-4, atol=1e-6)

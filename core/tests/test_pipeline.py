@@ -66,10 +66,8 @@ def test_nothing_is_left_to_compile_or_import_after_warming_up() -> None:
     # In a fresh process, whose kernels no other test has entered.
     script = """
 import core, numba, sys
-from core import tracking, warmup
 from numba.core.dispatcher import Dispatcher
 
-tracking.SERIAL_BELOW = warmup.SERIAL_BELOW = 10_000
 modules = [module for name, module in sys.modules.items() if name.startswith("core.")]
 kernels = [each for module in modules for each in vars(module).values()
            if isinstance(each, Dispatcher) and each.__module__ == module.__name__]
