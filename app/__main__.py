@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
+from threading import Thread
 from typing import Any
 
 import panel as pn
@@ -114,6 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
     if chosen.show:
         server.io_loop.add_callback(webbrowser.open, link)
     server.start()
+    Thread(target=core.warm_up, name="compiler", daemon=True).start()
     if watched is not None and arrivals is not None:
         PeriodicCallback(partial(look, watched, sources, arrivals), LOOK_MS).start()
     server.io_loop.start()  # until Ctrl+C
@@ -139,8 +141,8 @@ def ended_at_once() -> Iterator[None]:
 
 
 def prepare() -> None:
-    """Prepare this process for serving."""
-    core.warm_up(say_compiled)
+    """Prepare this process for serving: compile what the first page shows, and leave the rest."""
+    core.warm_up(say_compiled, only="tracking")
     tune()
     apply_patches()
     garbage.freeze_all()

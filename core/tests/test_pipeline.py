@@ -62,9 +62,11 @@ def test_without_truth_there_are_no_figures() -> None:
     assert run(Capture(capture.cube, capture.acquisition), "peak").figures == {}
 
 
-def test_nothing_is_left_to_compile_or_import_after_warming_up() -> None:
+@pytest.mark.parametrize("only", [None, "tracking"])
+def test_nothing_is_left_to_compile_or_import_after_warming_up(only: str | None) -> None:
     # In a fresh process, whose kernels no other test has entered.
-    script = """
+    script = f"""
+only = {only!r}
 import core, numba, sys
 from numba.core.dispatcher import Dispatcher
 
@@ -72,19 +74,20 @@ modules = [module for name, module in sys.modules.items() if name.startswith("co
 kernels = [each for module in modules for each in vars(module).values()
            if isinstance(each, Dispatcher) and each.__module__ == module.__name__]
 assert bool(kernels) != bool(numba.config.DISABLE_JIT)
-core.warm_up()
+core.warm_up(only=only)
 warm, imported = [len(each.signatures) for each in kernels], set(sys.modules)
 scene = core.scenes["uniform"](8)
 capture = core.simulate(scene, scene.acquisition, core.Flux())
-for method in core.ESTIMATORS:
+for method in [only] if only else core.ESTIMATORS:
     core.run(capture, method)
-flat = core.simulate(core.scenes["wall"](16), scene.acquisition, core.Flux(sbr=1.0))
-core.run(flat, "image_posterior")
+if only is None:
+    flat = core.simulate(core.scenes["wall"](16), scene.acquisition, core.Flux(sbr=1.0))
+    core.run(flat, "image_posterior")
 for settings in core.PRESETS.values():
     core.tracking_signals(capture.cube, settings)
     image = core.estimate(capture, "tracking", settings)
 core.inspection.pixel_report(capture, image, 0, 0)
-assert not {name for name in set(sys.modules) - imported if name.startswith("scipy")}
+assert not {{name for name in set(sys.modules) - imported if name.startswith("scipy")}}
 assert [len(each.signatures) for each in kernels] == warm
 """
     root = Path(core.__file__).parents[1]
