@@ -266,9 +266,10 @@ import sys, time
 import core
 from app.__main__ import main
 
-def compiling(progress):
-    print("compiling", flush=True)
-    time.sleep(600)
+def compiling(progress=None, only=None):
+    if only == {only!r}:
+        print("compiling", flush=True)
+        time.sleep(600)
 
 core.warm_up = compiling
 sys.exit(main(["--port", "0"]))
@@ -276,8 +277,10 @@ sys.exit(main(["--port", "0"]))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_ends_the_app_does_so_while_kernels_are_compiled(number):
-    with run("-c", COMPILING) as server:
-        assert next(server.stdout) == "compiling\n"
+@pytest.mark.parametrize("only", ["tracking", None])  # before the first page, and meanwhile
+def test_what_ends_the_app_does_so_while_kernels_are_compiled(only, number):
+    with run("-c", COMPILING.format(only=only)) as server:
+        while next(server.stdout) != "compiling\n":
+            pass
         server.send_signal(number)
-        assert server.wait(timeout=60) == -number
+        assert server.wait(timeout=60) == (0 if only is None else -number)
