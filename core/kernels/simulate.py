@@ -89,7 +89,7 @@ def _draw_pixel(fired_by, begin, end, key, guide, uniform, counts):  # type: ign
 
 @njit(**COMPILED)
 def draw_pulses(first, end, triggered, first_pulse, end_pulse, seed, cube):  # type: ignore[no-untyped-def]
-    """Add first-photon counts (pixel, bin) of pulses, up to before `end_pulse`."""
+    """Add first-photon counts (pixel, bin) of the pulses `first_pulse` to before `end_pulse`."""
     n_bins = cube.shape[1]
     for pixel in range(first, end):
         fired_by = np.full(n_bins + 1, 2.0)
