@@ -37,7 +37,14 @@ from core import inspection, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError, StatedFlux
 from core.corrections import CORRECTIONS, without_correction
-from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate, with_returns
+from core.estimators import (
+    ESTIMATORS,
+    Estimator,
+    RangeImage,
+    estimate,
+    judged_by_image,
+    with_returns,
+)
 from core.inference import (
     RangeInterval,
     Returns,
@@ -140,6 +147,7 @@ __all__ = [
     "first_difference",
     "first_photons",
     "inspection",
+    "judged_by_image",
     "light_of_whole",
     "limits",
     "metrics",

@@ -11,7 +11,15 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.cost import require_memory
 from core.deprecation import renamed
-from core.estimators import RangeImage, estimate, require_capture, settings_of
+from core.estimators import (
+    Judge,
+    RangeImage,
+    estimate,
+    judged_by_image,
+    require_capture,
+    require_judge,
+    settings_of,
+)
 from core.inference.posterior import posterior_of
 
 
@@ -42,13 +50,17 @@ class Run:
 
 
 def run(
-    capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
+    capture: Capture,
+    method: str,
+    settings: Any = None,
+    false_alarm: float | None = None,
+    judged_by: Judge = "pixel",
 ) -> Run:
     """Estimate a capture and compare the estimate with the truth, if known.
 
     Parameters
     ----------
-    capture, method, settings, false_alarm
+    capture, method, settings, false_alarm, judged_by
         As for `core.estimate`.
 
     Returns
@@ -61,6 +73,7 @@ def run(
         As `core.estimate`.
     """
     require_capture(capture)
+    require_judge(judged_by)
     settings = settings_of(method, settings)
     require_memory(capture, method, settings, false_alarm)
     started = perf_counter()
@@ -68,6 +81,8 @@ def run(
     flux_done = perf_counter()
     image = estimate(capture, method, settings, false_alarm=false_alarm)
     done = perf_counter()
+    if judged_by == "image":
+        image = judged_by_image(capture, image)
     truth_m, bin_m = capture.truth_range_m, capture.acquisition.bin_length_m
     figures = {} if truth_m is None else figures_of(image.range_m, truth_m, bin_m)
     return Run(capture, image, figures, flux_done - started, done - flux_done)

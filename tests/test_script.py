@@ -23,6 +23,7 @@ from app.pages.catalog import PAGES
 from app.pages.compare.ranking import run_task, tasks_of
 from app.pages.inspect.results import inspect_pixel, predict
 from app.pages.session import Session
+from core import RangeImage
 from core.io.readers.labelled import dataset
 from core.tests.captures import CAPTURES
 from tests.browser import ROOT
@@ -48,8 +49,7 @@ for folder in sys.argv[1:]:
     answers = {"image": found["image"]} | found.get("images", {})
     kept = {"picture": found.get("picture", 0)}
     for name, image in answers.items():
-        for each, value in vars(image).items():
-            kept[f"{name} {each}"] = 0 if value is None else getattr(value, "values", value)
+        kept |= {f"{name} {each}": plane.values for each, plane in image.planes.items()}
         kept[f"{name} made_by"] = str(image.made_by)
     for name, signals in ({"signals": found.get("signals")} | found.get("pinned", {})).items():
         if isinstance(signals, np.ndarray):
@@ -115,13 +115,13 @@ def check_style(folder: Path) -> None:
 
 def same(found: dict, name: str, expected) -> None:
     """Compare all arrays of a range image, or of signals, bit for bit."""
-    whole = expected._asdict() if hasattr(expected, "_asdict") else vars(expected)
-    for each, value in whole.items():
-        if each == "made_by":
-            assert str(found[f"{name} made_by"]) == str(value)
-            continue
-        numbers = 0 if value is None else getattr(value, "values", value)
-        assert np.array_equal(found[f"{name} {each}"], np.asarray(numbers), equal_nan=True), each
+    if isinstance(expected, RangeImage):
+        assert str(found[f"{name} made_by"]) == str(expected.made_by)
+        whole = {each: plane.values for each, plane in expected.planes.items()}
+    else:
+        whole = expected._asdict()
+    for each, numbers in whole.items():
+        assert np.array_equal(found[f"{name} {each}"], numbers, equal_nan=True), each
 
 
 def same_pixel(found: dict, name: str, pixel: Pixel) -> None:

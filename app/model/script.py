@@ -14,6 +14,7 @@ from textwrap import indent
 from app.model.state import CLOUDS, MOST_PROBABLE, VELOCITY, State, Viewing
 from app.model.store import Answer, bare
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
+from core.estimators import JUDGES
 from core.geometry import WHOLE, Box
 from core.io import RangeColors
 from core.scripts import assign, changed_fields, literal
@@ -169,8 +170,15 @@ def _estimate(answer: Answer, state: State) -> Lines:
     yield "\n# Estimate the ranges. `shown` has only pixels of sufficient confidence."
     yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **settings)
     several = {} if answer.request.returns == MOST_PROBABLE else {"returns": "2"}
-    yield assign("image", "core.estimate", "capture", method, "settings", **several)
+    yield assign(
+        "image", "core.estimate", "capture", method, "settings", **_judged(answer), **several
+    )
     yield from _shown(state.viewing.least_confidence)
+
+
+def _judged(answer: Answer) -> dict[str, str]:
+    judged_by = answer.request.judged_by
+    return {} if judged_by == JUDGES[0] else {"judged_by": literal(judged_by)}
 
 
 def _pair(a: Answer, b: Answer, state: State) -> Lines:
@@ -287,7 +295,8 @@ def _comparison(answer: Answer, state: State) -> Lines:
         except ValueError:
             yield f"# {method} is left out: it needs the true signal and background."
         else:
-            options = changed_fields(answer.request.settings_of(method)) | false_alarm
+            options = changed_fields(answer.request.settings_of(method))
+            options |= false_alarm | _judged(answer)
             yield assign(f"images[{name}]", "core.estimate", "capture", name, **options)
     has_clouds = chosen.kind == CLOUDS
     yield "\n# Save the images. `shown` has only pixels of sufficient confidence."

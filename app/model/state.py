@@ -21,7 +21,7 @@ from core import (
     Window,
 )
 from core.checks import require
-from core.estimators import FALSE_ALARM
+from core.estimators import FALSE_ALARM, JUDGES
 from core.geometry import Box
 from core.io import RangeColors, ReadOptions
 from core.parameters import Choice, Number, Settings, check_fields, parameter
@@ -407,6 +407,11 @@ class State(param.Parameterized):
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
     settings: Any = Checked(
         default_settings(), _check_settings, doc="Settings of each other estimator."
+    )
+    judged_by = param.Selector(
+        default=JUDGES[0],
+        objects=list(JUDGES),
+        doc="What determines confidence: the pixel alone, or its neighbours, too.",
     )
     returns = param.Selector(
         default=MOST_PROBABLE,

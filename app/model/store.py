@@ -37,6 +37,7 @@ from core import (
     TrackingParameters,
     Window,
     first_difference,
+    judged_by_image,
     rate_per_bin,
     read_capture,
     run,
@@ -48,8 +49,8 @@ from core import (
     without,
     without_correction,
 )
-from core.cost import Cost, predicted, predicted_returns_time
-from core.estimators import suitable_method
+from core.cost import Cost, cost_of, predicted, predicted_returns_time
+from core.estimators import JUDGES, Judge, suitable_method
 from core.geometry import guessed_field_of_view_deg
 from core.inference import has_posterior, pixel_range_intervals, posterior_of
 from core.inspection import PixelReport
@@ -216,6 +217,7 @@ class Request:
     """Key of `core.ESTIMATORS`, or `AUTOMATIC`."""
     settings: Mapping[str, Any] = field(default_factory=default_settings, hash=False)
     """Settings of the other estimators by their keys."""
+    judged_by: Judge = JUDGES[0]
     returns: str = MOST_PROBABLE
     """One of `app.model.state.RETURNS`."""
     absent: frozenset[str] = frozenset()
@@ -422,7 +424,7 @@ def _estimate(capture: Capture, request: Request, previous: Answer | None) -> tu
         previous is not None
         and capture is previous.capture
         and (method, settings) == (previous.method, previous.settings)
-        and request.returns == previous.request.returns
+        and _agree(request, previous.request, "judged_by", "returns")
     ):
         return previous.run, 0.0
     with ranging(capture, method, settings):
@@ -432,12 +434,36 @@ def _estimate(capture: Capture, request: Request, previous: Answer | None) -> tu
             posterior_of(capture)  # every confidence is computed from it, whatever the method
             flux_s = perf_counter() - started
         found = run(capture, method, settings)
+    found = judged(found, request.judged_by)
     if request.returns == ALL_RETURNS:
-        rows, cols, n_bins = capture.cube.shape
-        cost = predicted_returns_time(rows * cols, n_bins)
-        with spending((rows, cols, n_bins), ALL_RETURNS, cost):
+        with spending(capture.cube.shape, ALL_RETURNS, _returns_cost(capture)):
             found = replace(found, image=with_returns(capture, found.image))
     return found, flux_s
+
+
+def judged(found: Run, judged_by: Judge) -> Run:
+    """Return an estimate with the confidence by one of `core.estimators.JUDGES`, within limits."""
+    if judged_by == "pixel":
+        return found
+    with ranging(found.capture, "image_posterior"):
+        return replace(found, image=judged_by_image(found.capture, found.image))
+
+
+def predicted_seconds(request: Request, previous: Answer) -> float:
+    """Predict the time of an estimate of the capture of a previous one."""
+    capture, method = previous.capture, request.method_for(previous.capture)
+    seconds = cost_of(capture, method, request.settings_of(method)).seconds
+    if request.returns == ALL_RETURNS:
+        seconds += _returns_cost(capture).seconds
+    kept = {each: getattr(request, each) for each in ("method", "tracking", "settings", "returns")}
+    if request.judged_by == "image" and request != replace(previous.request, **kept):
+        seconds += cost_of(capture, "image_posterior").seconds  # kept with its capture
+    return seconds
+
+
+def _returns_cost(capture: Capture) -> Cost:
+    rows, cols, n_bins = capture.cube.shape
+    return predicted_returns_time(rows * cols, n_bins)
 
 
 def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:

@@ -60,6 +60,12 @@ AUTOMATIC_TITLE = "Automatic, by the capture"
 
 METHOD_HELP = "Estimator of the image, the cloud, the plots of a pixel, and everything saved."
 
+JUDGE_HELP = (
+    "What the confidence of an estimate is computed from: the counts of its pixel alone, or those "
+    "of the neighbouring pixels, too, by the posterior of the image. At a low SBR the image knows "
+    "much better which estimates are right. Takes up to a second."
+)
+
 RETURNS_HELP = (
     "Surfaces of a pixel in the 3D cloud, on Inspect and in files: the most probable one, or up to "
     "two, where the second is accepted in 1 % of the pixels with one surface. Takes a second or "

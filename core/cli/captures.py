@@ -23,6 +23,7 @@ from core.cli.options import (
     add_crop,
     add_filters,
     add_flux,
+    add_judge,
     add_pixel,
     add_returns,
     add_settings,
@@ -293,6 +294,7 @@ def _add_estimate(commands: Any) -> None:
         add_truth_options(method)
         add_flux(method)
         add_filters(method)
+        add_judge(method)
         add_returns(method)
         add_crop(method)
         add_colors(method)
@@ -323,6 +325,8 @@ def _estimate(chosen: argparse.Namespace) -> None:
         refuse_further_values(chosen.intervals, chosen.fit)
         one = chosen.returns == 1
         require("returns", chosen.returns, one, "1 for a capture that is ranged in tiles")
+        alone = chosen.judged_by == "pixel"
+        require("judged_by", chosen.judged_by, alone, "'pixel' for a capture ranged in tiles")
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
     save = save_ranges(
         described,
@@ -371,7 +375,7 @@ def _range_at_once(
         tuning = tuned(capture, chosen.method)
         print(tuning.why, file=sys.stderr)
         settings = tuning.settings
-    found = run(capture, chosen.method, settings, chosen.false_alarm)
+    found = run(capture, chosen.method, settings, chosen.false_alarm, chosen.judged_by)
     facts: dict[str, Any] = found.figures | {
         "remark": ESTIMATORS[chosen.method].remark(capture, chosen.false_alarm),
         "flux_s": found.flux_time_s,

@@ -17,7 +17,7 @@ import numpy as np
 
 from core.acquisition import Flux
 from core.checks import require
-from core.estimators import FALSE_ALARM
+from core.estimators import FALSE_ALARM, JUDGES
 from core.geometry import Box
 from core.inference import FALSE_RETURN, MOST_RETURNS
 from core.io import read_options_from
@@ -115,6 +115,17 @@ def add_returns(command: Any) -> None:
         type=float,
         default=FALSE_RETURN,
         help=f"accepted share of pixels with one surface that get a second ({FALSE_RETURN:g})",
+    )
+
+
+def add_judge(command: Any) -> None:
+    """Add the option for what determines the confidence."""
+    command.add_argument(
+        "--judged-by",
+        choices=JUDGES,
+        default=JUDGES[0],
+        help="confidence from the counts of the pixel alone, or from those of its neighbours, too "
+        f"({JUDGES[0]})",
     )
 
 

@@ -26,16 +26,21 @@ from core.estimators import (
     velocity,
 )
 from core.estimators.base import FALSE_ALARM, Estimator, Provenance, RangeImage
+from core.estimators.judging import JUDGES, Judge, judged_by_image, require_judge
 from core.estimators.returns import with_returns
 
 __all__ = [
     "ESTIMATORS",
     "FALSE_ALARM",
+    "JUDGES",
     "Estimator",
+    "Judge",
     "Provenance",
     "RangeImage",
     "estimate",
+    "judged_by_image",
     "require_capture",
+    "require_judge",
     "settings_of",
     "suitable_method",
     "with_returns",
@@ -65,6 +70,7 @@ def estimate(
     settings: Any = None,
     *,
     false_alarm: float | None = None,
+    judged_by: Judge = "pixel",
     returns: int = 1,
     **parameters: Any,
 ) -> RangeImage:
@@ -81,6 +87,9 @@ def estimate(
         Give a range only where the score exceeds the threshold that this share of echo-free pixels
         exceeds. If None, every pixel with a detection gets one. The methods "unmixing" and
         "image_posterior" ignore it; see their settings ``false_acceptance`` and ``pixels``.
+    judged_by : {"pixel", "image"}
+        What determines the confidence: the counts of the pixel alone, or those of its neighbours,
+        too (`judged_by_image`).
     returns : int
         Surfaces of a pixel to look for, at most 4; `RangeImage.returns` holds them if more than 1
         (`with_returns`).
@@ -100,12 +109,15 @@ def estimate(
     """
     require_capture(capture)
     settings = settings_of(method, settings, **parameters)
+    require_judge(judged_by)
     require_memory(capture, method, settings, false_alarm)
     estimator = ESTIMATORS[method]
     made_by = Provenance(
         method, settings, false_alarm, partial(estimator.remark, capture, false_alarm)
     )
     image = replace(estimator(capture, settings, false_alarm), made_by=made_by)
+    if judged_by == "image":
+        image = judged_by_image(capture, image)
     return image if returns == 1 else with_returns(capture, image, returns)
 
 

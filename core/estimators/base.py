@@ -75,6 +75,8 @@ class Provenance:
         Estimates of less confidence have been removed, see `RangeImage.confident`.
     box : Box, optional
         Estimates outside it have been removed, see `RangeImage.cropped`.
+    judged_by : str, optional
+        ``"image"`` if the confidence is from `core.judged_by_image`.
     most_returns, false_return : int and float, optional
         `most` and `false_return` of `core.with_returns`.
     """
@@ -85,6 +87,7 @@ class Provenance:
     remark: _Deferred = _Deferred()
     least_confidence: float | None = None
     box: Box | None = None
+    judged_by: str | None = None
     most_returns: int | None = None
     false_return: float | None = None
 
@@ -121,8 +124,9 @@ class RangeImage:
     confidence : ndarray of float
         Posterior probability of a surface within 3 bins of the estimate, from the exact
         first-photon likelihood and the fluxes estimated from the capture
-        (`core.inference.posterior`); of the method "image_posterior", from its own, which includes
-        the neighbours. It is calibrated for every estimator: of pixels with
+        (`core.inference.posterior`); of the method "image_posterior", and of others that are judged
+        by it (`core.judged_by_image`), from the posterior of the image, which includes the
+        neighbours. It is calibrated for every estimator: of pixels with
         confidence 0.9, nine in ten are right, unless the remark of `made_by` says that the model
         does not fit (`core.inference.fit`). 0 where `valid` is False.
     valid : ndarray of bool

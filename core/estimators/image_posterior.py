@@ -241,9 +241,11 @@ def least_probability(surface: Floats) -> float:
     return max(0.5, float(likeliest_first[max(n_accepted - 1, 0)]))
 
 
-def _confidence(
-    capture: Capture, flux: FluxModel, delay_bin: Floats, parameters: ImageParameters
-) -> Floats:
+def probability_near(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
+    """Return the probability of a surface within `TOLERANCE_BINS` of delays (row, col).
+
+    By the posterior of the image; by that of each pixel alone where neighbours do not agree.
+    """
     if not _neighbours_agree(flux):
         return tolerance_probability(capture, delay_bin)
     found = image_posterior_of(capture, flux)
@@ -294,6 +296,6 @@ ESTIMATOR = Estimator(
     undoes_pile_up=True,
     whole_image=True,
     fills=True,
-    confidence=_confidence,
+    confidence=lambda capture, flux, delay_bin, _: probability_near(capture, flux, delay_bin),
     evidence=_evidence,
 )

@@ -172,7 +172,8 @@ def pixel_report(
     capture : Capture
     image : RangeImage
         Estimate of the capture with this method and these settings; with returns, several of the
-        pixel are candidates (`core.with_returns`).
+        pixel are candidates (`core.with_returns`). If it is judged by the posterior of the image
+        (`core.judged_by_image`), so are the candidates.
     row, col : int
     method, settings
         As for `core.estimate`.
@@ -191,7 +192,12 @@ def pixel_report(
     evidence = ESTIMATORS[method].evidence_at(capture, row, col)
     lag = lag_bins(capture, method, settings)
     interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
-    candidates, confidence = _candidates(capture, image, row, col, curve, evidence, method, lag)
+    judge, scores = evidence, curve
+    if evidence is not None:
+        scores = np.log(np.maximum(evidence.posterior, np.finfo(float).tiny))
+    elif image.made_by is not None and image.made_by.judged_by == "image":
+        judge = ESTIMATORS["image_posterior"].evidence_at(capture, row, col)
+    candidates, confidence = _candidates(capture, image, row, col, scores, judge, method, lag)
     answer_bin = float(image.bin[row, col])
     likely = [each.bin for each in candidates if each.probability >= LIKELY]
     surfaces_bin = tuple(sorted(likely, key=lambda at: at != answer_bin))
@@ -267,14 +273,15 @@ def _candidates(
     row: int,
     col: int,
     curve: Floats,
-    evidence: Evidence | None,
+    judge: Evidence | None,
     method: str,
     lag_bins: float,
 ) -> tuple[tuple[RangeCandidate, ...], float]:
-    """Return the candidates and the probability of the estimate, whether it is one of them."""
+    """Return the candidates and the probability of the estimate, whether it is one of them.
+
+    Candidates are maxima of `curve`; their probabilities are by `judge`, or by the pixel alone.
+    """
     estimate_bin, confidence = float(image.bin[row, col]), float(image.confidence[row, col])
-    if evidence is not None:
-        curve = np.log(np.maximum(evidence.posterior, np.finfo(float).tiny))
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
     # A signal far below the image's mean makes all scores of the likelihood negative.
     base = 0.0 if curve.max() > 0 else float(np.median(curve))
@@ -299,14 +306,14 @@ def _candidates(
     bins, score = bins[kept], curve[peaks[kept]]
     of_one = (
         tolerance_probability_at(capture, row, col, bins)
-        if evidence is None
-        else _mass_around(evidence.posterior, bins)
+        if judge is None
+        else _mass_around(judge.posterior, bins)
     )
     probability = surface_probabilities(capture, row, col, bins, of_one)
     if returns is not None:
         probability[np.argsort(kept)[:n_returns]] = returns.confidence
     is_estimate = bins == estimate_bin
-    if ESTIMATORS[method].confidence is not None:  # which knows more than the pixel
+    if judge is not None or ESTIMATORS[method].confidence is not None:  # more than the pixel knows
         probability[is_estimate] = confidence
     elif is_estimate.any():
         confidence = float(probability[is_estimate][0])

@@ -45,6 +45,7 @@ from app.pages.shared.downloads import (
     viewed,
 )
 from app.pages.shared.echo_zoom import EchoZoom
+from app.pages.shared.method import judge_choice
 from app.pages.shared.section import Section
 from app.pages.shared.viewing import show_own_width
 from app.tasks.scheduler import RETURN_MS
@@ -238,7 +239,7 @@ class Compare(Section):
             self.offer_table(self.table, "methods"),
         ]
         return main, [
-            part("Methods", self.picks, self._false_alarm),
+            part("Methods", self.picks, self._false_alarm, judge_choice(self.session.state)),
             *self._folds.values(),
             part("View", self._viewing.without("least_confidence"), is_open=False),
         ]

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from app.model.budget import ranging
 from app.model.state import Comparison
-from app.model.store import Answer, Request, is_wrong
+from app.model.store import Answer, Request, is_wrong, judged
 from core import ESTIMATORS, Capture, RangeImage, estimate, limits, metrics, run
+from core.estimators import JUDGES, Judge
 from core.inference import fit_of
 from core.inspection import CONFIDENT
 
@@ -26,17 +27,18 @@ MIN_PIXELS = 20
 
 @dataclass(frozen=True)
 class Task:
-    """A method to run, and its settings."""
+    """A method to run, its settings, and what determines its confidence."""
 
     method: str
     settings: Any
     false_alarm: float = 1.0
+    judged_by: Judge = JUDGES[0]
 
 
 def tasks_of(chosen: Comparison, request: Request) -> dict[str, Task]:
     """Return the chosen methods with the settings of a request, in the order of the registry."""
     return {
-        method: Task(method, request.settings_of(method), chosen.false_alarm)
+        method: Task(method, request.settings_of(method), chosen.false_alarm, request.judged_by)
         for method in ESTIMATORS
         if method in chosen.methods
     }
@@ -80,12 +82,12 @@ class Reference:
 def run_task(task: Task, explored: Answer) -> Result:
     """Run a method on the capture of an estimate, or take that estimate if it is the same."""
     capture = explored.capture
-    if task == Task(explored.method, explored.settings):
+    if task == Task(explored.method, explored.settings, judged_by=explored.request.judged_by):
         answer = explored
     else:
         with ranging(capture, task.method, task.settings, task.false_alarm):
             ran = run(capture, task.method, task.settings, task.false_alarm)
-        answer = replace(explored, run=ran)
+        answer = replace(explored, run=judged(ran, task.judged_by))
     fit_of(capture)  # stated by the remarks
     return Result(answer, accuracy_of(answer))
 

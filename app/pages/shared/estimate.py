@@ -19,6 +19,7 @@ from app.model.store import (
     Request,
     Source,
     compute,
+    predicted_seconds,
     same_subject,
     same_view,
 )
@@ -27,7 +28,6 @@ from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane
 from app.tasks.signals import Signal
-from core.cost import cost_of
 
 BUSY_MS = 200
 """Time after which a progress bar is shown."""
@@ -35,7 +35,7 @@ BUSY_MS = 200
 FEW_COUNTS = 2**20
 """Size of a cube (pixels × bins) up to which an estimate takes less time than drawing it."""
 
-FEW_S = 0.25
+FEW_S = 0.1
 """Predicted time up to which an estimate may run on the page's thread."""
 
 
@@ -170,8 +170,7 @@ def lane_of(request: Request, previous: Answer) -> Lane:
     before = previous.request
     if previous.cutout is not None or previous.whole.cube.size > FEW_COUNTS:
         return GENERAL
-    method = request.method_for(previous.capture)
-    if cost_of(previous.capture, method, request.settings_of(method)).seconds > FEW_S:
+    if predicted_seconds(request, previous) > FEW_S:
         return GENERAL
     chosen = {name: getattr(request, name) for name in ("method", "tracking", "settings")}
     if request == replace(before, **chosen):

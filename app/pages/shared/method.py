@@ -9,13 +9,20 @@ import panel as pn
 
 from app.model import text
 from app.model.methods import OTHERS, doubts_hold, method_title
-from app.model.state import AUTOMATIC
+from app.model.state import AUTOMATIC, State
 from app.model.store import Answer
 from app.pages.session import Session
 from app.pages.shared.tuning import SettingsChooser
 from app.widgets.cards import choice, part, select
 from app.widgets.controls import Sentence, SettingsPanel
 from core import ESTIMATORS
+
+
+def judge_choice(state: State) -> Any:
+    """Return buttons for what determines the confidence."""
+    made = choice(text.JUDGE_HELP, state.param.judged_by)
+    made.param.update(label="Confidence from", sizing_mode="stretch_width")
+    return made
 
 
 class MethodChoice:
@@ -48,10 +55,12 @@ class MethodChoice:
         self.panels: dict[str, SettingsPanel[Any]] = {}
         self._settings = pn.Column(sizing_mode="stretch_width", margin=0)
         self.chooser = SettingsChooser(session)
+        self.judge = judge_choice(session.state)
         self.returns = choice(text.RETURNS_HELP, session.state.param.returns)
         self.returns.param.update(label="Returns", sizing_mode="stretch_width")
+        choices = self.judge, self.returns
         self.part = part(
-            "Method", self.menu, self.note, self._settings, self.returns, self.chooser.part
+            "Method", self.menu, self.note, self._settings, *choices, self.chooser.part
         )
         self.menu.param.watch(lambda event: setattr(self._state, "method", event.new), "value")
 
