@@ -89,6 +89,7 @@ results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core tuned --results assets/results/tuned.md
 	$(BIN)/python -m core calibration --only confidence ranges --seeds 8 --results assets/results/calibration.md
+	$(BIN)/python -m core calibration --only judged --seeds 8 --results assets/results/judged.md
 	$(BIN)/python -m core calibration --only fluxes --captures 40 --results assets/results/fluxes.md
 	$(BIN)/python -m core calibration --only alarms --captures 10 --results assets/results/alarms.md
 	$(BIN)/python -m core fit --results assets/results/fit.md

@@ -46,6 +46,7 @@ FACTORS = (0.25, 0.5, 0.7, 1.4, 2.0, 4.0)
 FIXED = {
     "tracking": ("h", "refine"),  # only (m·h)²·l matters; a pixel is right or wrong without it
     "likelihood": ("steps_per_bin",),  # finer steps only cost time
+    "image_posterior": ("false_surface",),  # of targets, most are found if all pixels get a range
 }
 """Settings that no search changes, by the name of the estimator."""
 

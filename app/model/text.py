@@ -36,8 +36,9 @@ ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-backgrou
 TOUR_HELP = "Tour: five stops that explain the page Explore."
 
 CONFIDENCE_HELP = (
-    "Probability of a surface within 3 bins of the estimate. In a pixel of several surfaces, the "
-    "report's confidence may exceed that of the map, which assumes one."
+    "Probability of a surface within 3 bins of the estimate, from the counts of the pixel or of "
+    "the image (Confidence from, under Method). In a pixel of several surfaces, the report's "
+    "confidence may exceed that of the map, which assumes one."
 )
 
 RANGE_HELP = (

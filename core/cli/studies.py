@@ -16,6 +16,7 @@ from core.studies.methods import (
     calibration,
     field,
     fit,
+    judged,
     motion,
     neighbours,
     returns,
@@ -30,6 +31,7 @@ from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition, Method, Results, trials
 from core.tracking import PRESETS
 
+_CALIBRATED = "confidence", "judged", "ranges", "fluxes", "alarms"
 MAX_SEEDS = recommend.SEEDS.start  # from there on they are the search's
 
 
@@ -81,11 +83,11 @@ def add(commands: Any) -> None:
     _add_count(command, "--captures", 1, 1000, 8)
     command.add_argument(
         "--only",
-        choices=("confidence", "ranges", "fluxes", "alarms"),
+        choices=_CALIBRATED,
         nargs="+",
-        default=("confidence", "ranges", "fluxes", "alarms"),
-        help="measure these; --seeds holds for confidence and ranges, --captures for each regime "
-        "of the fluxes and each background of false alarms (all)",
+        default=_CALIBRATED,
+        help="measure these; --seeds holds for confidence, judged and ranges, --captures for each "
+        "regime of the fluxes and each background of false alarms (all)",
     )
     add_processes(command)
 
@@ -187,6 +189,7 @@ def _calibration(chosen: argparse.Namespace) -> None:
     seeds, counted = range(chosen.seeds), list[alarms.Alarms]()
     tables: dict[str, Callable[[], Iterable[Table]]] = {
         "confidence": lambda: calibration.calibration_tables(seeds),
+        "judged": lambda: [judged.judged_table(seeds, chosen.processes)],
         "ranges": lambda: [calibration.coverage_table(seeds, chosen.processes)],
         "fluxes": lambda: [calibration.flux_table(chosen.captures, chosen.processes)],
         "alarms": lambda: [alarms.alarms_table(counted)],

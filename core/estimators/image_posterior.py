@@ -54,13 +54,13 @@ from core.kernels.blocks import LANES
 from core.kernels.messages import fill_modes, fill_posterior
 from core.kernels.parallel import on_threads
 from core.kernels.planes import fill_planes
-from core.parameters import Settings, parameter
+from core.parameters import Number, Settings, parameter
 
 _ROUNDS = 3
 _LEAST_ODDS = 1e-12
 _EMPTY_SHARE = 0.01  # of pixels without an echo, if every pixel is estimated
 _UNLIKELY = 0.1  # probability of a surface below which its signal level is unknown
-_FALSE_SURFACE = 0.01  # share of the empty pixels that get a range, if pixels may be empty
+_FALSE_PIXELS = 0.5  # of an image, that may get a range whatever the share of empty ones
 _ALONG_PLANES = 0.8, 0.15  # ρ and the scale of K in bins
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
@@ -74,8 +74,13 @@ class ImageParameters(Settings):
         PIXELS,
         "Estimate every pixel: each gets its likeliest range, as if nearly all had a surface. "
         "Allow empty pixels: only those get a range in which a surface is likelier than none, and "
-        "so likely that about 1 % of the empty pixels get one. "
+        "so likely that few empty pixels get one (see false surfaces). "
         "Confidence never assumes a surface.",
+    )
+    false_surface: float = parameter(
+        0.01,
+        Number("False surfaces", 1e-4, 0.1, log=True, least=0.0, open_below=True, most=1.0),
+        "If empty pixels are allowed: largest share of them that may get a range.",
     )
 
 
@@ -224,20 +229,24 @@ def _locate(
     found = image_posterior_of(capture, flux)
     surface = np.clip(found.surface, _LEAST_ODDS, 1 - _LEAST_ODDS)
     if parameters.pixels == "allow empty pixels":
-        delay = np.where(surface >= least_probability(surface), found.delay, np.nan)
+        delay = np.where(
+            surface >= least_probability(surface, parameters.false_surface), found.delay, np.nan
+        )
     else:
         delay = likeliest_delays(capture, flux)
     return delay, np.log(surface / (1 - surface))
 
 
-def least_probability(surface: Floats) -> float:
+def least_probability(surface: Floats, false_surface: float) -> float:
     """Return the probability of a surface, 0.5 at least, from which a pixel gets a range.
 
-    Such that the expected share of the empty pixels that get one is at most `_FALSE_SURFACE`.
+    Such that the expected share of the empty pixels that get one is at most `false_surface`, or
+    half a pixel of the image: of an image that has hardly any empty pixel, few would get a range.
     """
     likeliest_first = np.sort(surface, axis=None)[::-1]
     false = np.cumsum(1 - likeliest_first)
-    n_accepted = int(np.searchsorted(false, _FALSE_SURFACE * false[-1], side="right"))
+    most = max(false_surface * false[-1], _FALSE_PIXELS)
+    n_accepted = int(np.searchsorted(false, most, side="right"))
     return max(0.5, float(likeliest_first[max(n_accepted - 1, 0)]))
 
 

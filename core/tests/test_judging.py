@@ -13,6 +13,7 @@ from core.effects import Motion
 from core.inspection import pixel_report
 from core.metrics import calibration_error, reliability
 from core.studies.methods.calibration import confidence_and_right
+from core.studies.methods.judged import METHODS, judged_table
 from core.studies.trials import Condition
 
 compiled = pytest.mark.compiled
@@ -112,3 +113,14 @@ def test_what_cannot_be_judged_is_refused() -> None:
     for call in (core.estimate, core.run):
         with pytest.raises(ValueError, match=r"judged_by = .*both.* not accepted"):
             call(capture, "peak", judged_by="both")  # type: ignore[operator]
+
+
+@compiled
+def test_a_table_compares_both_confidences() -> None:
+    found = judged_table(range(1), conditions=[Condition("piecewise", 0.03)])
+    rows = [dict(zip(found.columns, row, strict=True)) for row in found.rows]
+    assert [row["method"] for row in rows] == list(METHODS)
+    for row in rows:
+        assert row["image: error"] < row["pixel: error"]
+        assert row["image: sure"] > row["pixel: sure"]
+        assert row["image: sure and right"].high >= 0.9

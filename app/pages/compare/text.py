@@ -42,8 +42,10 @@ plotted. A method's estimate is the maximum of its score minus the method's lag,
 from the model.
 
 **Confidence** is the same for all methods: the probability, from the exact likelihood, of a
-surface within 3 bins of the estimate. In the *reliability diagram*, a line on the diagonal means
-that nine of ten estimates with confidence 0.9 are correct. Pixels without a target count as wrong.
+surface within 3 bins of the estimate. *Confidence from* chooses whether the counts of the pixel
+alone determine it, or those of the neighbouring pixels, too. In the *reliability diagram*, a line
+on the diagonal means that nine of ten estimates with confidence 0.9 are correct. Pixels without a
+target count as wrong.
 
 **The oracle** is the likelihood with known signal and background. **The single-pixel limit** has
 two parts: the probability that the oracle's likeliest delay is that of the echo, if depths are
