@@ -25,6 +25,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
 
 from core.acquisition import MOST_PULSES, Floats
@@ -135,26 +136,39 @@ def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
     prior = Prior.of(flux)
     q = found.surface.reshape(3, one.size, -1).astype(float)
     dark = found.nothing.reshape(3, one.size).astype(float)
+    apart = one.size // 2  # pixels are in random order
+    by_chance = np.roll(q[1:], apart, axis=1), np.roll(dark[1:], apart, axis=1)
     best, chance = UNRELATED, 0.0
-    apart = np.roll(np.arange(one.size), one.size // 2)  # pixels are in random order
     for scale in _SCALES_BINS:
-        smooth = _smoothed(q[0], laplace(scale)) / prior.surface
+        smooth = scipy.ndimage.correlate1d(q[0], laplace(scale), mode="constant") / prior.surface
 
-        def alike(others: NDArray[np.intp], smooth: Floats = smooth) -> Floats:
-            ratio = [
-                np.vecdot(smooth, q[i, others]) + dark[0] * dark[i, others] / prior.nothing
-                for i in (1, 2)
-            ]
-            return np.asarray(np.log1p(_SHARES[:, np.newaxis] * (np.concatenate(ratio) - 1)))
+        def ratios(surface: Floats, nothing: Floats, smooth: Floats = smooth) -> Floats:
+            return np.asarray(np.vecdot(smooth, surface) + dark[0] * nothing / prior.nothing)
 
-        gain = alike(np.arange(one.size))
-        chance = max(chance, float(alike(apart).mean(axis=1).max()))
-        k = int(gain.mean(axis=1).argmax())
-        mean, error = float(gain[k].mean()), float(gain[k].std()) / math.sqrt(gain.shape[1])
+        chance = max(chance, float(_likeliest_share(ratios(*by_chance))[1].mean()))
+        share, gain = _likeliest_share(ratios(q[1:], dark[1:]))
+        mean, error = float(gain.mean()), float(gain.std()) / math.sqrt(gain.size)
         if mean > max(best.gain, _SURE * error):
-            best = Agreement(mean, float(_SHARES[k]), scale)
+            best = Agreement(mean, share, scale)
     left = best.gain - chance
     return best._replace(gain=left) if left > 0.5 * best.gain else UNRELATED
+
+
+def _likeliest_share(ratio: Floats) -> tuple[float, Floats]:
+    """Find the ρ of `_SHARES` with the largest mean of ``log(1 - ρ + ρ c)``; return these, too.
+
+    The mean is concave in ρ: its maximum lies where the derivative changes its sign.
+    """
+    excess = ratio - 1
+    low, high = 0, _SHARES.size - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if np.mean(excess / (1 + _SHARES[middle] * excess)) > 0:
+            low = middle
+        else:
+            high = middle
+    found = [(float(share), np.log1p(share * excess)) for share in _SHARES[[low, high]]]
+    return max(found, key=lambda each: float(each[1].mean()))
 
 
 class Prior(NamedTuple):
@@ -216,15 +230,3 @@ def laplace(scale_bins: float) -> Floats:
     half = min(max(1, math.ceil(7 * scale_bins)), 16)
     kernel = np.exp(-np.abs(np.arange(-half, half + 1)) / scale_bins)
     return np.asarray(kernel / kernel.sum())
-
-
-def _smoothed(values: Floats, kernel: Floats) -> Floats:
-    """Correlate (pixel, bin) with a symmetric kernel, with zeros beyond the gate."""
-    n_bins, half = values.shape[1], kernel.size // 2
-    sums = np.zeros_like(values)
-    for j, tap in enumerate(kernel):
-        shift = j - half
-        begin, end = max(0, -shift), min(n_bins, n_bins - shift)
-        if begin < end:
-            sums[:, begin:end] += tap * values[:, begin + shift : end + shift]
-    return sums
