@@ -84,6 +84,16 @@ def test_time_is_limited_like_memory(source, monkeypatch):
         compute(ask(source), answer)
 
 
+def test_confidence_from_the_image_counts_for_the_limits(source, monkeypatch):
+    monkeypatch.setattr(budget, "REQUEST_S", 0.4)
+    judged = replace(ask(source), judged_by="image")
+    assert compute(ask(source), None).request.less == ReductionSettings()
+    answer = compute(judged, None)
+    assert answer.request.less != ReductionSettings()
+    with pytest.raises(ValueError, match="estimated time of 'image_posterior'"):
+        compute(judged, answer)
+
+
 def test_computations_of_other_pages_are_limited(source, monkeypatch):
     answer = compute(ask(source), None)
     monkeypatch.setattr(budget, "REQUEST_S", 1e-4)

@@ -390,7 +390,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         capture, capture_s = previous.capture, previous.capture_s
     else:
         shape = _reduced_shape(whole, request)
-        require_fitting(shape, request.method_for(whole), _cost(whole, request))
+        require_fitting(shape, _costliest(whole, request), _cost(whole, request))
         capture = reduced(whole, request)
         if request.less != requested:
             source = f"{capture.source}; reduced to fit the limits of this server"
@@ -473,8 +473,13 @@ def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:
     return reduction.shape(shape) if reduction.fits(shape) else shape
 
 
+def _costliest(whole: Capture, request: Request) -> str:
+    """Return the method of a request that takes most memory and time."""
+    return "image_posterior" if request.judged_by == "image" else request.method_for(whole)
+
+
 def _cost(whole: Capture, request: Request) -> Cost:
-    method = request.method_for(whole)
+    method = _costliest(whole, request)
     return predicted(_reduced_shape(whole, request), method, request.settings_of(method))
 
 
@@ -484,7 +489,7 @@ def _fitting(whole: Capture, request: Request) -> ReductionSettings:
         return request.less
     rows, cols, n_bins = whole.cube.shape
     least = request.less.reduction(n_bins)
-    found = fitting((rows, cols, n_bins), request.method_for(whole), least)
+    found = fitting((rows, cols, n_bins), _costliest(whole, request), least)
     return request.less if found is None else replace(request.less, merge=found[0], skip=found[1])
 
 
