@@ -21,10 +21,12 @@ from core.cli.options import (
     add_colors,
     add_crop,
     add_filters,
+    add_judge,
     add_settings,
     colors_given,
     crop_given,
     reading,
+    refuse_judging,
     settings_given,
     show,
     show_progress,
@@ -38,7 +40,7 @@ from core.cli.saving import (
     save_each,
     save_ranges,
 )
-from core.estimators import ESTIMATORS, Provenance, RangeImage
+from core.estimators import ESTIMATORS, JUDGES, Judge, Provenance, RangeImage
 from core.geometry import WHOLE, Box
 from core.inspection import estimate_mean_flux
 from core.io.names import changed_settings, distinct_names, file_name, named
@@ -67,6 +69,7 @@ class Job:
     options: dict[str, Any]
     """Arguments of `core.read_capture`."""
     false_alarm: float | None = None
+    judged_by: Judge = JUDGES[0]
     least_confidence: float | None = None
     """Estimates below it are not written."""
     colors: RangeColors | None = None
@@ -149,6 +152,7 @@ def add(commands: Any) -> None:
             "whose kernels run on all cores)",
         )
         method.add_argument("--json", action="store_true", help="one JSON object, by file")
+        add_judge(method)
         add_filters(method)
         add_crop(method)
         add_colors(method)
@@ -194,6 +198,8 @@ def _jobs(chosen: argparse.Namespace) -> list[Job]:
     for name in ("false_alarm", "least_confidence"):
         if (value := getattr(chosen, name)) is not None:
             named_settings.append(named(name.replace("_", "-"), value))
+    if chosen.judged_by != JUDGES[0]:
+        named_settings.append(named("judged-by-", chosen.judged_by))
     formats = dict.fromkeys((chosen.format or ["npz"]) if chosen.out else ())
     colors, box = colors_given(chosen), crop_given(chosen)
     jobs = []
@@ -215,6 +221,7 @@ def _jobs(chosen: argparse.Namespace) -> list[Job]:
             settings,
             reading(chosen),
             chosen.false_alarm,
+            chosen.judged_by,
             chosen.least_confidence,
             colors,
             box,
@@ -311,11 +318,12 @@ def _estimate(job: Job) -> tuple[CaptureInfo, RangeImage, float]:
     n_bytes = bytes_of(job.path, **job.options)
     if n_bytes is None or n_bytes <= MAX_CUBE_BYTES:
         capture: Capture = read_capture(job.path, **job.options)
-        found = run(capture, job.method, job.settings, job.false_alarm)
+        found = run(capture, job.method, job.settings, job.false_alarm, job.judged_by)
         return capture, found.image, estimate_mean_flux(capture).sbr.value
     from core.out_of_core import tiles  # noqa: PLC0415 - loads Dask
 
     refuse_further_values(job.intervals, job.fit)
+    refuse_judging(job.judged_by)
     counts = open_capture(job.path, **job.options)
     parts = tiles.estimate_large(counts, job.method, job.settings, false_alarm=job.false_alarm)
     return *tiles.as_image(parts.compute()), np.nan
@@ -331,6 +339,8 @@ def _cells(row: Row) -> tuple[Any, ...]:
 def _csv(rows: Sequence[Row], job: Job) -> str:
     """Return the rows as CSV, with method, settings and version."""
     made_by = Provenance(job.method, job.settings, job.false_alarm, "", job.least_confidence)
+    if job.judged_by != JUDGES[0]:
+        made_by = made_by.after(judged_by=job.judged_by)
     about = made_by.facts | {"software": software()}
     table = ([*astuple(row), *about.values()] for row in rows)
     return as_csv((*(each.name for each in fields(Row)), *about), without_nan(table))

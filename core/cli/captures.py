@@ -32,6 +32,7 @@ from core.cli.options import (
     crop_given,
     flux_of,
     reading,
+    refuse_judging,
     require_none,
     settings_given,
     show,
@@ -325,8 +326,7 @@ def _estimate(chosen: argparse.Namespace) -> None:
         refuse_further_values(chosen.intervals, chosen.fit)
         one = chosen.returns == 1
         require("returns", chosen.returns, one, "1 for a capture that is ranged in tiles")
-        alone = chosen.judged_by == "pixel"
-        require("judged_by", chosen.judged_by, alone, "'pixel' for a capture ranged in tiles")
+        refuse_judging(chosen.judged_by)
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
     save = save_ranges(
         described,

@@ -129,6 +129,12 @@ def add_judge(command: Any) -> None:
     )
 
 
+def refuse_judging(judged_by: str) -> None:
+    """Raise ``ValueError`` if the image is to judge a capture that is ranged in tiles."""
+    accepted = "'pixel' for a capture that is ranged in tiles"
+    require("judged_by", judged_by, judged_by == JUDGES[0], accepted)
+
+
 def add_filters(command: Any) -> None:
     """Add the options for the accepted rate of false alarms and the confidence of what is saved."""
     add_false_alarm(command)

@@ -13,6 +13,7 @@ from core.cli.options import (
     add_colors,
     add_crop,
     add_false_alarm,
+    add_judge,
     add_pixel,
     add_settings,
     colors_given,
@@ -23,7 +24,7 @@ from core.cli.options import (
     show,
 )
 from core.cli.saving import refused_outputs
-from core.estimators import ESTIMATORS, estimate
+from core.estimators import ESTIMATORS, JUDGES, estimate
 from core.geometry import WHOLE
 from core.io.readers import read_capture
 from core.io.readers.options import add_read_options, read_options_from
@@ -58,6 +59,7 @@ def add(commands: Any) -> None:
             help=f"maps and cloud hide estimates of less confidence ({LEAST_CONFIDENCE:g})",
         )
         add_false_alarm(method)
+        add_judge(method)
         add_crop(method)
         add_colors(method)
         method.add_argument("--overwrite", action="store_true", help="replace the file")
@@ -77,7 +79,8 @@ def _report(chosen: argparse.Namespace) -> None:
     if truth:
         capture = read_truth(capture=capture, **truth)
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
-    image = estimate(capture, chosen.method, settings, false_alarm=chosen.false_alarm)
+    given = {"false_alarm": chosen.false_alarm, "judged_by": chosen.judged_by}
+    image = estimate(capture, chosen.method, settings, **given)
     save_report(
         capture,
         image,
@@ -109,9 +112,10 @@ def _lines(chosen: argparse.Namespace, settings: Any) -> Iterator[str]:
         yield assign("capture", "core.read_truth", name, "capture", **given)
     method = literal(chosen.method)
     yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **changed_fields(settings))
-    alarm = chosen.false_alarm
-    limits = {} if alarm is None else {"false_alarm": literal(alarm)}
-    yield assign("image", "core.estimate", "capture", method, "settings", **limits)
+    given = {} if chosen.false_alarm is None else {"false_alarm": literal(chosen.false_alarm)}
+    if chosen.judged_by != JUDGES[0]:
+        given["judged_by"] = literal(chosen.judged_by)
+    yield assign("image", "core.estimate", "capture", method, "settings", **given)
     view = {"least_confidence": literal(chosen.least_confidence)}
     if chosen.pixel is not None:
         view["pixel"] = literal(tuple(chosen.pixel))

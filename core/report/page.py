@@ -18,7 +18,7 @@ import numpy as np
 from core import metrics
 from core.acquisition import Floats
 from core.capture import Capture
-from core.estimators import ESTIMATORS, Provenance, RangeImage
+from core.estimators import ESTIMATORS, JUDGES, Provenance, RangeImage
 from core.geometry import WHOLE, Box
 from core.inference import fit_of, fit_p_values_of, share_below
 from core.inspection import (
@@ -468,6 +468,7 @@ def _settings(made_by: Provenance, least_confidence: float) -> Iterator[str]:
     facts = [
         ("Method", _text(ESTIMATORS[made_by.method].title)),
         ("False-alarm rate", "not limited" if alarm is None else _number(alarm)),
+        ("Confidence from", made_by.judged_by or JUDGES[0]),
         ("Shown from confidence", _number(least_confidence)),
         ("Software", _text(software())),
         ("Python", platform.python_version()),

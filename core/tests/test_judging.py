@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 import core
+from core.cli import main
 from core.effects import Motion
 from core.inspection import pixel_report
 from core.metrics import calibration_error, reliability
@@ -124,3 +127,28 @@ def test_a_table_compares_both_confidences() -> None:
         assert row["image: error"] < row["pixel: error"]
         assert row["image: sure"] > row["pixel: sure"]
         assert row["image: sure and right"].high >= 0.9
+
+
+@compiled
+def test_the_command_line_takes_the_judge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    capture = Condition("piecewise", 0.03).capture(0)
+    expected = core.estimate(capture, "tracking", judged_by="image")
+    core.save_capture(capture, "planes.npz")
+    by_image = "--judged-by", "image"
+    assert (
+        main(["estimate", "tracking", "--capture", "planes.npz", *by_image, "--out", "a.npz"]) == 0
+    )
+    assert main(["batch", "tracking", "planes.npz", *by_image, "--out", "found"]) == 0
+    assert main(["report", "tracking", "planes.npz", "report.html", *by_image]) == 0
+    for path in ("a.npz", "found/planes_tracking_judged-by-image_range-image.npz"):
+        with np.load(path) as archive:
+            np.testing.assert_array_equal(archive["confidence"], expected.confidence)
+            assert archive["judged_by"] == "image"
+    with open("found/summary.csv", encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    assert row["judged_by"] == "image"
+    assert float(row["mean_confidence"]) == pytest.approx(expected.confidence.mean())
+    assert "judged_by=&quot;image&quot;" in Path("report.html").read_text("utf-8")
