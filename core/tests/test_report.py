@@ -281,7 +281,7 @@ def test_the_command_and_its_script_write_the_same_report(
     np.save("truth.npy", CAPTURE.truth_range_m)
     command = ["report", "cfar", "a 'b' <c>.npz", "report.html", "--pixel", "3", "4"]
     options = ["--truth", "truth.npy", "--truth-unit", "m", "--least-confidence", "0.5"]
-    more = ["--guard-bins", "2", "--pulses", "400"]
+    more = ["--guard-bins", "2", "--pulses", "400", "--judged-by", "image"]
     more += ["--color-from", "40", "--color-map", "viridis"]
     more += ["--crop", "-", "1e5", "--crop-pixels", "-1,-1 -1,20 20,20"]
     assert main([*command, *options, *more]) == 0
