@@ -25,6 +25,7 @@ from core.kernels.blocks import LANES
 __all__ = [
     "Cost",
     "cost_of",
+    "n_groups_of",
     "needs",
     "predicted",
     "predicted_fit_time",
@@ -114,6 +115,7 @@ def predicted(
     *,
     false_alarm: float | None = None,
     n_taps: int = 16,
+    n_groups: int = 0,
     posterior_is_cached: bool = False,
 ) -> Cost:
     """Predict working memory and time of `core.estimate`.
@@ -126,6 +128,8 @@ def predicted(
         As for `core.estimate`.
     n_taps : int
         Bins that an echo fills (`core.Pulse.taps`).
+    n_groups : int
+        Groups of pulses in order, in which "velocity" looks for motion.
     posterior_is_cached : bool
         Whether the posterior of the capture has been computed.
 
@@ -175,6 +179,10 @@ def predicted(
         n_null = n_bins * max(min(n_pixels, 64 * 64), 2**23 // n_bins)
         n_bytes += _NULL_COUNT_BYTES * n_null
         seconds += (_NULL_S + rates.count_s) * n_null
+    if method == "velocity" and n_groups:
+        n_velocities = 2 * (24 if settings is None else settings.most_bins) + 1
+        n_bytes += (4 * n_groups + 16) * n_counts + 40 * n_velocities * n_pixels
+        seconds += _MOVING_S * n_velocities * (n_groups + n_taps) * n_counts
     return Cost(int(n_bytes), seconds)
 
 
@@ -233,22 +241,20 @@ def cost_of(
     """Predict working memory and time of an estimate of a capture; see `predicted`."""
     echo, _ = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
     rows, cols, n_bins = capture.cube.shape
-    cost = predicted(
+    return predicted(
         (rows, cols, n_bins),
         method,
         settings,
         false_alarm=false_alarm,
         n_taps=echo.size,
+        n_groups=n_groups_of(capture),
         posterior_is_cached=has_posterior(capture),
     )
-    if method != "velocity" or capture.groups is None:
-        return cost
-    n_groups, n_counts = len(capture.groups.counts), capture.cube.size
-    n_velocities = 2 * (24 if settings is None else settings.most_bins) + 1
-    n_bytes = cost.working_bytes + 4 * n_groups * n_counts + 16 * n_counts
-    n_bytes += 40 * n_velocities * rows * cols
-    seconds = cost.seconds + _MOVING_S * n_velocities * (n_groups + echo.size) * n_counts
-    return Cost(n_bytes, seconds)
+
+
+def n_groups_of(capture: Capture) -> int:
+    """Return the number of groups of pulses that a capture keeps, 0 for none."""
+    return 0 if capture.groups is None else len(capture.groups.counts)
 
 
 def require_memory(

@@ -12,7 +12,7 @@ import pytest
 
 from app.model import budget
 from app.model.state import ReductionSettings
-from app.model.store import compute, file_source
+from app.model.store import Request, built_in_sources, compute, file_source
 from app.pages.compare.ranking import Task, run_task
 from app.pages.inspect.results import inspect_capture, inspect_pixel_with_flux
 from app.pages.session import Session
@@ -92,6 +92,13 @@ def test_confidence_from_the_image_counts_for_the_limits(source, monkeypatch):
     assert answer.request.less != ReductionSettings()
     with pytest.raises(ValueError, match="estimated time of 'image_posterior'"):
         compute(judged, answer)
+
+
+def test_groups_of_pulses_count_for_the_limits(monkeypatch):
+    monkeypatch.setattr(budget, "REQUEST_S", 0.5)
+    moving = Request(built_in_sources()["approach"], method="velocity")
+    assert compute(replace(moving, method="likelihood"), None).request.less == ReductionSettings()
+    assert compute(moving, None).request.less != ReductionSettings()
 
 
 def test_computations_of_other_pages_are_limited(source, monkeypatch):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from itertools import product
@@ -13,7 +13,7 @@ import psutil
 
 from core import Capture
 from core.checks import require
-from core.cost import Cost, cost_of, needs, predicted
+from core.cost import Cost, cost_of, needs
 from core.reductions import Reduction
 
 REQUEST_BYTES = 2**30
@@ -118,7 +118,10 @@ def ranging(
 
 
 def fitting(
-    shape: tuple[int, int, int], method: str, least: Reduction, most: int = 8
+    shape: tuple[int, int, int],
+    cost: Callable[[tuple[int, int, int]], Cost],
+    least: Reduction,
+    most: int = 8,
 ) -> tuple[int, int] | None:
     """Find the weakest merging of bins and skipping of pixels with which a capture fits.
 
@@ -126,7 +129,8 @@ def fitting(
     ----------
     shape : tuple of int
         Rows, columns and bins of the capture.
-    method : str
+    cost : callable
+        Predicts the cost of an estimate of a capture of a shape.
     least : Reduction
         Reduction that is applied in any case.
     most : int
@@ -140,6 +144,6 @@ def fitting(
     factors = product(range(least.merge, most + 1), range(least.skip, most + 1))
     for merge, skip in sorted(factors, key=lambda each: (each[0] * each[1] ** 2, each[1])):
         reduction = replace(least, merge=merge, skip=skip)
-        if reduction.fits(shape) and fits(predicted(reduction.shape(shape), method)):
+        if reduction.fits(shape) and fits(cost(reduction.shape(shape))):
             return merge, skip
     return None

@@ -49,7 +49,7 @@ from core import (
     without,
     without_correction,
 )
-from core.cost import Cost, cost_of, predicted, predicted_returns_time
+from core.cost import Cost, cost_of, n_groups_of, predicted, predicted_returns_time
 from core.estimators import JUDGES, Judge, suitable_method
 from core.geometry import guessed_field_of_view_deg
 from core.inference import has_posterior, pixel_range_intervals, posterior_of
@@ -390,7 +390,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         capture, capture_s = previous.capture, previous.capture_s
     else:
         shape = _reduced_shape(whole, request)
-        require_fitting(shape, _costliest(whole, request), _cost(whole, request))
+        require_fitting(shape, _costliest(whole, request), _cost(whole, request, shape))
         capture = reduced(whole, request)
         if request.less != requested:
             source = f"{capture.source}; reduced to fit the limits of this server"
@@ -478,18 +478,19 @@ def _costliest(whole: Capture, request: Request) -> str:
     return "image_posterior" if request.judged_by == "image" else request.method_for(whole)
 
 
-def _cost(whole: Capture, request: Request) -> Cost:
+def _cost(whole: Capture, request: Request, shape: tuple[int, int, int]) -> Cost:
+    """Predict the cost of a request for a capture that is reduced to a shape."""
     method = _costliest(whole, request)
-    return predicted(_reduced_shape(whole, request), method, request.settings_of(method))
+    return predicted(shape, method, request.settings_of(method), n_groups=n_groups_of(whole))
 
 
 def _fitting(whole: Capture, request: Request) -> ReductionSettings:
     """Return the requested reduction, or the weakest stronger one that fits."""
-    if fits(_cost(whole, request)):
+    cost = partial(_cost, whole, request)
+    if fits(cost(_reduced_shape(whole, request))):
         return request.less
     rows, cols, n_bins = whole.cube.shape
-    least = request.less.reduction(n_bins)
-    found = fitting((rows, cols, n_bins), _costliest(whole, request), least)
+    found = fitting((rows, cols, n_bins), cost, request.less.reduction(n_bins))
     return request.less if found is None else replace(request.less, merge=found[0], skip=found[1])
 
 
