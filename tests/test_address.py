@@ -87,6 +87,7 @@ def test_defaults_are_left_out_those_of_the_capture_included():
         ("region=[[1,2,3]]", "region"),
         ("region=" + "[" * 10_000, "region"),
         ("region=" + "[" * 30_000, "region is not accepted: it has over"),
+        ("pixel=20,12", "pixel = '20,12' is not accepted: give a value such as [31,24]."),
         ("absent=[[1]]", "absent"),
         ("absent=everything", "absent"),
         ("difference=1", "difference"),

@@ -63,12 +63,16 @@ def _entries(name: str, value: Any, default: Any) -> dict[str, str]:
     if parts is None:
         if isinstance(default, str):
             return {name: value}
-        return {name: json.dumps(value, separators=(",", ":"), default=sorted)}
+        return {name: _as_json(value)}
     known = _parts(default) or {}
     entries: dict[str, str] = {}
     for each, part in parts.items():
         entries |= _entries(f"{name}.{each}", part, known.get(each))
     return entries
+
+
+def _as_json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), default=sorted)
 
 
 def _parts(value: Any) -> dict[str, Any] | None:
@@ -184,7 +188,7 @@ class Link:
             return _like(base, json.loads(text))
         except (ValueError, TypeError, RecursionError):
             is_number = base is None or isinstance(base, float)
-            expected = "a finite number" if is_number else f"a value such as {base}"
+            expected = "a finite number" if is_number else f"a value such as {_as_json(base)}"
             self.refused.append(f"{name} = {text[:80]!r} is not accepted: give {expected}.")
             return base
 
