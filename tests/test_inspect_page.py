@@ -16,6 +16,7 @@ from app.model.script import script_of
 from app.model.state import (
     MAPS,
     NEEDED,
+    NEIGHBOURS,
     VELOCITY,
     Crop,
     Illumination,
@@ -301,6 +302,15 @@ def test_the_image_posterior_shows_what_neighbours_tell():
     session.state.method = "likelihood"
     session.tasks.run_until(lambda: section.found.report.method == "likelihood")
     assert section.found.report.evidence is None
+    session.state.plot = NEIGHBOURS
+    assert section.explanation.visible
+    assert "Here the score is shown" in section.explanation.text
+    assert section.plots.below(section.found, NEIGHBOURS) is section.plots.score
+    session.state.judged_by = "image"
+    session.tasks.run_until(lambda: section.found.report.evidence is not None)
+    assert not section.explanation.visible
+    assert section.plots.below(section.found, NEIGHBOURS) is section.plots.evidence
+    assert section.plots.below(section.found, "Score") is section.plots.score
 
 
 def test_everything_about_a_pixel_is_cores(building):

@@ -11,7 +11,7 @@ from dataclasses import fields
 from itertools import chain
 from textwrap import indent
 
-from app.model.state import CLOUDS, MOST_PROBABLE, VELOCITY, State, Viewing
+from app.model.state import CLOUDS, MOST_PROBABLE, NEIGHBOURS, VELOCITY, State, Viewing
 from app.model.store import Answer, bare
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
 from core.estimators import JUDGES
@@ -234,6 +234,8 @@ def _plot(name: str, report: str, pixels: str) -> Lines:
     if name == "Fit":
         yield f"pixels = {pixels}"
         yield assign("expected", "core.inference.predictive_of", "capture", "pixels")
+    if name == NEIGHBOURS:
+        yield f"evidence = {report}.evidence"
 
 
 def _signals(method: str, name: str, pixel: str) -> str:

@@ -291,7 +291,10 @@ MAPS = (
 )
 UNITS = ("bins", "ns", "m")
 HELD = ("background", "SBR")
-PLOTS = ("Score", "Rate", "Fit")
+NEIGHBOURS = "Neighbours"
+"""The plot of what neighbours tell about a pixel."""
+
+PLOTS = ("Score", "Rate", "Fit", NEIGHBOURS)
 SUBJECTS = ("Pixel", "Region", "Pins", "Profile", "A/B", "Capture")
 STUDIES = ("Speed and accuracy", "Acquisition", "Ablation", "Sensitivity")
 PAPER_SECTIONS = (

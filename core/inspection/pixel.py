@@ -79,8 +79,8 @@ class PixelReport(OldFluxNames):
     curve: Floats
     """Score of each bin, not corrected for the lag, shape (bin,)."""
     evidence: Evidence | None
-    """Evidence of the pixel and of its neighbours, for the method "image_posterior"; None for
-    methods of single pixels, and where neighbours have no influence."""
+    """Evidence of the pixel and of its neighbours, for the method "image_posterior" and estimates
+    that are judged by it; None for others, and where neighbours have no influence."""
     lag_bins: float
     """Distance from the delay of the surface to the maximum of the score."""
     answer_bin: float
@@ -189,15 +189,13 @@ def pixel_report(
     settings = settings_of(method, settings)
     counts = capture.cube[row, col].astype(float)
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
-    evidence = ESTIMATORS[method].evidence_at(capture, row, col)
+    evidence = own = ESTIMATORS[method].evidence_at(capture, row, col)
+    if own is None and image.made_by is not None and image.made_by.judged_by == "image":
+        evidence = ESTIMATORS["image_posterior"].evidence_at(capture, row, col)
     lag = lag_bins(capture, method, settings)
     interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
-    judge, scores = evidence, curve
-    if evidence is not None:
-        scores = np.log(np.maximum(evidence.posterior, np.finfo(float).tiny))
-    elif image.made_by is not None and image.made_by.judged_by == "image":
-        judge = ESTIMATORS["image_posterior"].evidence_at(capture, row, col)
-    candidates, confidence = _candidates(capture, image, row, col, scores, judge, method, lag)
+    scores = curve if own is None else np.log(np.maximum(own.posterior, np.finfo(float).tiny))
+    candidates, confidence = _candidates(capture, image, row, col, scores, evidence, method, lag)
     answer_bin = float(image.bin[row, col])
     likely = [each.bin for each in candidates if each.probability >= LIKELY]
     surfaces_bin = tuple(sorted(likely, key=lambda at: at != answer_bin))

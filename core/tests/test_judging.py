@@ -103,7 +103,10 @@ def test_candidates_of_a_pixel_are_judged_like_its_estimate() -> None:
     best = max(after.candidates, key=lambda each: each.probability)
     assert (best.bin, best.probability) == (after.answer_bin, after.confidence)
     assert [each.score for each in after.candidates] == [each.score for each in before.candidates]
-    assert after.evidence is None  # the plot remains that of the method
+    assert before.evidence is None
+    assert after.evidence is not None
+    around = np.abs(np.arange(capture.acquisition.n_bins) + 0.5 - after.answer_bin) <= 3
+    assert after.evidence.alone[around].sum() < 0.5 < after.evidence.neighbours[around].sum()
 
 
 def test_what_cannot_be_judged_is_refused() -> None:

@@ -11,6 +11,7 @@ import panel as pn
 
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import Write
+from app.model.state import NEIGHBOURS
 from app.model.store import Answer
 from app.model.text import COMPUTING, reason
 from app.pages.inspect import text
@@ -203,7 +204,10 @@ class PixelSection(Section):
         for each, plot in zip(self.cards, self.plots.plots, strict=True):
             each.visible = plot in shown
         self._drawn, self._is_outdated = found, False
-        self.explanation.visible = with_fit
+        is_without = state.plot == NEIGHBOURS and found.report.evidence is None
+        self.explanation.visible = with_fit or is_without
+        if is_without:
+            self.explanation.text = text.NO_EVIDENCE
         if with_fit:
             self.explanation.text = text.fit_explanation(math.nan)
             self._fit_jobs.submit(

@@ -84,9 +84,13 @@ MODE_HELP = (
     "line of a profile. A tap always selects a pixel."
 )
 PLOT_HELP = (
-    "Plot below the histogram: the estimator's score or its stages (for the image posterior, the "
-    "evidence of the pixel and of its neighbours), the rate corrected for pile-up, or the "
-    "residuals of the counts from those that the model expects."
+    "Plot below the histogram: the estimator's score or its stages, the rate corrected for "
+    "pile-up, the residuals of the counts from those that the model expects, or the probability "
+    "of the surface from the pixel, from its neighbours, and from both."
+)
+NO_EVIDENCE = (
+    "Neighbours are shown for a single pixel, if Confidence from (under Method) is the image and "
+    "neighbouring pixels agree. Here the score is shown."
 )
 SUBJECT_HELP = (
     "What to inspect: one pixel, the region, the pinned pixels, the line that joins them, or the "

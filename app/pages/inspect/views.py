@@ -22,7 +22,7 @@ from bokeh.models import (
 from numpy.typing import NDArray
 
 from app.model.exports import Curve, band
-from app.model.state import MOST_PINS
+from app.model.state import MOST_PINS, NEIGHBOURS
 from app.model.store import Pixel
 from app.pages.inspect.results import Corners, Inspected
 from app.pages.shared.outputs import layers_of
@@ -34,6 +34,7 @@ from app.theme import Palette
 from app.units import ShownGate, scale
 from app.widgets.figures import Layers, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
+from core import ESTIMATORS
 from core.inference import Predictive
 from core.inspection import FaultyPixel
 
@@ -347,7 +348,8 @@ class PixelPlots:
     score : GatePlot
         Score of another method, in its place.
     evidence : GatePlot
-        Likewise, of a method that uses neighbours: their evidence and that of the pixel.
+        The evidence of the neighbours and of the pixel; in place of the score of a method that
+        uses neighbours.
     residuals : GatePlot
         Residuals of the counts from those that the model expects.
     plots : tuple of GatePlot
@@ -390,9 +392,10 @@ class PixelPlots:
 
     def below(self, found: Inspected, name: str) -> GatePlot:
         """Return the plot of one of `app.model.state.PLOTS`."""
-        if name != "Score":
-            return {"Rate": self.rate, "Fit": self.residuals}[name]
-        if found.report.evidence is not None:
+        if name in ("Rate", "Fit"):
+            return self.rate if name == "Rate" else self.residuals
+        is_score = ESTIMATORS[found.report.method].evidence is not None
+        if found.report.evidence is not None and (is_score or name == NEIGHBOURS):
             return self.evidence
         return self.score if found.pixel.signals is None else self.stages
 
@@ -418,7 +421,7 @@ class PixelPlots:
         if report.evidence is not None:
             self.evidence.draw(gate, curves("probability", **report.evidence._asdict()) + marks)
             self.evidence.frame(*report.evidence)
-        elif pixel.signals is None:
+        if pixel.signals is None:
             self.score.figure.title.text = plots.score_title(plots.SCORE_TITLE, pixel, along)
             self.score.draw(gate, curves("", score=pixel.score) + marks)
             fit(self.score.figure, *plots.score_ends(pixel.score))
