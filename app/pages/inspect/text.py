@@ -165,7 +165,7 @@ def _velocity_facts(answer: Answer, pixel: Pixel) -> list[Fact]:
     if velocity is None or not answer.run.image.valid[row, col]:
         return []
     help = "Radial velocity with its 95 % interval; positive if the surface recedes."
-    return [("Velocity", velocity.text_at(row, col), help)]
+    return [("Velocity", velocity.text_at(row, col).replace("-", "−"), help)]
 
 
 def _region_facts(found: Inspected, unit: str) -> list[Fact]:
