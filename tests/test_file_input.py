@@ -111,4 +111,4 @@ def test_an_empty_file_of_which_no_part_arrives_is_refused(given, complaints):
     begin(given)
     finish(given)
     assert given.value is None
-    assert complaints == ["The file is empty: save it again, or choose another one."]
+    assert complaints == ["it is empty; save it again, or choose another one."]

@@ -94,7 +94,7 @@ class FileInput(pmui.FileInput):
                 self._is_empty = False
                 self._require_part(msg)
             elif status == "finished" and self._is_empty:  # an empty file has no parts
-                raise ValueError("The file is empty: save it again, or choose another one.")
+                raise ValueError("it is empty; save it again, or choose another one.")
             super()._handle_msg(msg)
         except Exception as error:  # a message may be malformed in many ways
             self._discard()

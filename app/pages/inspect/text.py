@@ -76,8 +76,9 @@ map *Goodness of fit* shows where it fails.
 MAP_HELP = (
     "Quantity shown on the map. Peak: largest count of a pixel. Fired: share of pulses with a "
     "detection. SBR: estimated from the counts. Goodness of fit: p-value, below 0.05 in 5 % of the "
-    "pixels where the model holds. Returns: surfaces that each pixel shows by itself; 1 % of those "
-    "with one get a second. Reported: distance that the sensor itself found."
+    "pixels where the model holds. Returns: number found in each pixel without its neighbours; 1 % "
+    "of the pixels with one surface show a second by chance. Reported: distance that the sensor "
+    "found."
 )
 MODE_HELP = (
     "What dragging on the map does: zoom, select a region by a rectangle or a lasso, or draw the "
