@@ -91,10 +91,15 @@ WRAPPED = """
   display: flex; flex-wrap: wrap; justify-content: flex-end; width: auto; row-gap: 0;
 }
 """
-"""Style of a horizontal legend inside a plot: rows no wider than the plot."""
+"""Style of a horizontal legend: rows no wider than the plot."""
 
-RAISED = ":host { padding-bottom: 7px !important; }"
-"""Style of a legend above a plot, which else touches the uppermost label of the axis."""
+RAISED = """
+:host(:not(.bk-vertical)) { padding-bottom: 7px !important; max-width: calc(100% + 40px); }
+"""
+"""Further style of a legend above or below a plot, which else touches an axis or the border.
+
+Its width is relative to the frame, beside which there is room for the labels of an axis.
+"""
 
 STYLES: dict[str, dict[str, object]] = {
     # Transparent, so that the card's colour changes with the mode.

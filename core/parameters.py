@@ -90,8 +90,11 @@ class Number:
     def check(self, name: str, value: object) -> None:
         """Raise ``ValueError`` unless `value` is acceptable."""
         noun = "an integer" if self.whole else "a number"
-        relation = "above" if self.open_below else "from"
-        bounds = f"{noun} {relation} {self.least:g} to {self.most:g}"
+        least = "above" if self.open_below else "from"
+        bounds = f"{noun} {least} {self.least:g} to {self.most:g}"
+        if math.isinf(self.most):
+            least = "above" if self.open_below else "of at least"
+            bounds = noun if math.isinf(self.least) else f"{noun} {least} {self.least:g}"
         if self.optional:
             bounds += ", or None"
         require(name, value, self.takes(value), bounds)

@@ -6,7 +6,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from app.pages.catalog import PAGES
-from tests.browser import VIEWS, eventually, image, slider, stage
+from tests.browser import EDGES, VIEWS, eventually, image, slider, stage
 from tests.test_browser import use_the_controls
 from tests.test_compare import compare_the_methods
 from tests.test_inspect_browser import expect_a_steady_frame, inspect_the_building
@@ -39,12 +39,12 @@ PLOT_NAMES = f"""() => {{
 
 LEGENDS_FIT = f"""() => {{
   {VIEWS}
-  const inside = ({{ model, plot_view }}) =>
-    model.type === "Legend" && plot_view.model.center.includes(model);
-  return views.filter(inside).every(({{ el, plot_view }}) =>
+  const beside = ({{ model, plot_view }}) => plot_view.model.right.includes(model);
+  const legends = views.filter(({{ model }}) => model.type === "Legend");
+  return legends.filter((each) => !beside(each)).every(({{ el, plot_view }}) =>
     el.getBoundingClientRect().left >= plot_view.el.getBoundingClientRect().left);
 }}"""
-"""Whether legends inside plots are as narrow as these."""
+"""Whether legends inside, above and below plots are as narrow as these."""
 
 
 def expect_readable(page: Page, name: str) -> None:
@@ -59,7 +59,14 @@ def expect_readable(page: Page, name: str) -> None:
             plots = page.evaluate(PLOTS)
             inside = all(each["left"] >= 0 and each["right"] <= width for each in plots)
             least = min((each["height"] for each in plots), default=0)
-            return inside and least >= LEAST_HEIGHT_PX and page.evaluate(LEGENDS_FIT)
+            tables = page.locator(".scroll").filter(visible=True).evaluate_all(EDGES)
+            apart = not any(
+                each["top"] < bottom and top < each["bottom"] - 1
+                for each in plots
+                for left, top, right, bottom in tables
+                if each["left"] < right and left < each["right"]
+            )
+            return inside and least >= LEAST_HEIGHT_PX and apart and page.evaluate(LEGENDS_FIT)
 
         eventually(fit)
         expect(page.get_by_role("button", name="Toggle theme")).to_be_in_viewport(ratio=1)

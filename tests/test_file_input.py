@@ -105,3 +105,10 @@ def test_unfinished_files_are_not_kept(given, complaints):
         send(given, name=f"{n}.npz")
     assert "one file at a time" in complaints[0]
     assert len(complaints) == 25  # every second one is refused, with the one before it
+
+
+def test_an_empty_file_of_which_no_part_arrives_is_refused(given, complaints):
+    begin(given)
+    finish(given)
+    assert given.value is None
+    assert complaints == ["it is empty; save it again, or choose another one."]

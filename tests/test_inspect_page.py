@@ -885,7 +885,7 @@ def test_the_likelihood_with_velocity_shows_velocities():
     assert np.nanmedian(drawn) == pytest.approx(-20, rel=0.05)  # the scene's
     section = on_screen(PixelSection(session, "pixel"))
     velocity = answer.run.image.velocity
-    assert values(section.facts)["Velocity"] == velocity.text_at(32, 32)
+    assert values(section.facts)["Velocity"] == velocity.text_at(32, 32).replace("-", "−")
     change(session, method="likelihood")
     assert VELOCITY not in session.state.param.map.objects
     assert session.state.map == "Estimate"

@@ -27,7 +27,7 @@ MAP_TITLES = {
     "Peak": "Largest count of each pixel",
     "Fired": "Share of the pulses that fired",
     "SBR": "Signal over background, estimated from the counts",
-    "Returns": "Number of surfaces that the pixel shows by itself",
+    "Returns": "Number of returns found in each pixel",
 }
 REPORTED_TITLE = "Distance reported by the sensor"
 FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"

@@ -267,7 +267,7 @@ def score_curves() -> hv.Overlay:
             marker="inverted_triangle", size=9, line_width=0
         ),
     ]
-    return _panel(layers, "Score of each bin: 0 is a curve's median, 1 its maximum").opts(
+    return _panel(layers, "Score of each bin (0: median, 1: maximum)").opts(
         hv.opts.Overlay(legend_position="right", legend_cols=1)
     )
 
@@ -359,7 +359,6 @@ def curves(item: items.Plot, colors: Palette) -> Any:
     legend = Legend(
         items=entries,
         orientation="vertical" if many else "horizontal",
-        ncols=3 if 3 < len(entries) <= 6 else "auto",
         click_policy="hide",
         background_fill_alpha=0.0,
     )
@@ -436,7 +435,7 @@ def pulse_figure(item: Pulses) -> Any:
         renderer.name = name
     entries = [LegendItem(label=PULSE_LAYERS[name][1], renderers=[drawn[name]]) for name in drawn]
     drawing.add_layout(
-        Legend(items=entries, orientation="horizontal", ncols=2, background_fill_alpha=0.0), "above"
+        Legend(items=entries, orientation="horizontal", background_fill_alpha=0.0), "above"
     )
     drawing.min_border_right = 32
     drawing.yaxis.ticker.min_interval = 1
@@ -534,7 +533,7 @@ def tradeoff(colors: Palette) -> Any:
         )
     )
     legend = drawing.legend[0]
-    legend.update(background_fill_alpha=0.0, orientation="horizontal", ncols=3)
+    legend.update(background_fill_alpha=0.0, orientation="horizontal")
     drawing.add_layout(legend, "below")  # on a phone there is no room at its side
     paint_tradeoff(drawing, colors)
     return drawing

@@ -24,7 +24,7 @@ from core import Acquisition
 TICKS = """
 const ends = [cb_data.start, cb_data.end].map((bin) => origin + step * bin);
 const [low, high] = [Math.min(...ends), Math.max(...ends)];
-const rough = (high - low) / 7;
+const rough = (high - low) / (innerWidth < 500 ? 5 : 7);
 if (!(rough > 0)) return [];
 const power = 10 ** Math.floor(Math.log10(rough));
 const least = name === "bins" ? 1 : 0;

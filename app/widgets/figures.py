@@ -165,8 +165,8 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
     for legend in figure.legend:
         if legend in figure.center:
             legend.stylesheets = [WRAPPED]
-        elif legend in figure.above:
-            legend.stylesheets = [RAISED]
+        elif legend not in figure.right:
+            legend.stylesheets = [WRAPPED, RAISED]
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
 
 

@@ -80,6 +80,7 @@ class FileInput(pmui.FileInput):
         most_bytes = 2 * params["max_file_size"]
         super().__init__(chunk_size=PART_BYTES, max_total_file_size=most_bytes, **params)
         self._complain = complain
+        self._is_empty = False
 
     def _handle_msg(self, msg: Mapping[str, Any]) -> None:
         try:
@@ -88,8 +89,12 @@ class FileInput(pmui.FileInput):
                 raise ValueError(str(msg.get("error"))[:_LONGEST_NAME])
             if status == "initializing":
                 self._discard()
+                self._is_empty = True
             elif status == "upload_event":
+                self._is_empty = False
                 self._require_part(msg)
+            elif status == "finished" and self._is_empty:  # an empty file has no parts
+                raise ValueError("it is empty; save it again, or choose another one.")
             super()._handle_msg(msg)
         except Exception as error:  # a message may be malformed in many ways
             self._discard()

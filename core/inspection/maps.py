@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import scipy  # loads a submodule when it is first used
 from numba import njit
@@ -73,7 +76,7 @@ def sbr(capture: Capture) -> Floats:
 
 
 @cached_per_capture
-def number_of_returns(capture: Capture) -> Floats:
+def number_of_returns(capture: Capture) -> NDArray[np.intp]:
     """Surfaces that each pixel shows by itself, shape (row, col).
 
     As `core.with_returns` finds them with its default rate of false returns; 0 where a surface is
@@ -81,7 +84,7 @@ def number_of_returns(capture: Capture) -> Floats:
     """
     n_echoes = fitted_echoes(capture, capture.cube, MOST_RETURNS, least_gain(capture)).number
     has_any = posterior_of(capture).surface >= LIKELY
-    return np.where(has_any, n_echoes.reshape(capture.shape), 0).astype(float)
+    return np.where(has_any, n_echoes.reshape(capture.shape), 0)
 
 
 @njit(**COMPILED)
@@ -98,7 +101,7 @@ def _count(first, last, cube, begin, end, before, inside):  # type: ignore[no-un
             inside[row, col] = total
 
 
-maps = {
+maps: dict[str, Callable[[Capture], NDArray[Any]]] = {
     "Peak": peak_counts,
     "Fired": share_fired,
     "SBR": sbr,

@@ -59,9 +59,9 @@ def test_sensible_values_are_accepted(accepted: dict[str, Any]) -> None:
         ({"width": True}, "a number above 0"),
         ({"width": None}, "a number above 0"),
         ({"width": 1j}, "a number above 0"),
-        ({"count": -1}, "an integer from 0 to"),
-        ({"count": 2.0}, "an integer from 0 to"),
-        ({"count": False}, "an integer from 0 to"),
+        ({"count": -1}, "an integer of at least 0"),
+        ({"count": 2.0}, "an integer of at least 0"),
+        ({"count": False}, "an integer of at least 0"),
         ({"way": "left"}, "'up' or 'down'"),
         ({"way": 1}, "'up' or 'down'"),
         ({"level": np.nan}, "a number"),
@@ -99,3 +99,16 @@ def test_the_literal_preset_takes_what_the_paper_prints() -> None:
     assert PRESETS["as printed"] == replace(literal, l=0.001)  # deprecated
     with pytest.raises(KeyError):
         PRESETS["printed"]
+
+
+@pytest.mark.parametrize(
+    ("spec", "accepted"),
+    [
+        (Number("x", 1, 2, least=0.0), "a number of at least 0"),
+        (Number("x", 1, 2, least=0.0, open_below=True), "a number above 0"),
+        (Number("x", 1, 2, least=0.0, most=1.0), "a number from 0 to 1"),
+    ],
+)
+def test_a_refused_value_names_what_is_accepted_without_infinite_bounds(spec, accepted):
+    with pytest.raises(ValueError, match=f"{accepted}[.]"):
+        spec.check("x", -1.0)

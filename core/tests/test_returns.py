@@ -211,6 +211,7 @@ def test_three_surfaces_are_found() -> None:
 def test_the_map_of_returns_counts_surfaces() -> None:
     capture, _ = two_surfaces(10.0, 0.5, 0.3, 16)
     counted_map = core.inspection.maps["Returns"](capture)
+    assert np.issubdtype(counted_map.dtype, np.integer)  # so that its scale has no fractions
     assert np.count_nonzero(counted_map == 2) >= binom.ppf(0.001, 256, 0.97)
     empty = replace(capture, cube=np.zeros_like(capture.cube))
     assert (core.inspection.maps["Returns"](empty) == 0).all()

@@ -86,7 +86,8 @@ PLOTS = """
   grid-auto-columns: minmax(0, 3fr); }
 .scroll-button { display: none; }
 @media screen and (max-width: 900px) {
-  :host { display: flex !important; flex-direction: column; height: 670px !important; }
+  :host { display: flex !important; flex: none !important; flex-direction: column;
+    height: 670px !important; }
 }
 """
 HEAD = """

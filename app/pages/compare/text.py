@@ -68,8 +68,8 @@ FALSE_ALARM_HELP = (
 TABLE = "Methods and their figures; click a column's header to sort."
 
 LIMIT_UNKNOWN = (
-    "Not known: it requires the true range and flux of every pixel, which only simulated scenes "
-    "have."
+    "Not known: it requires the true range and flux of every pixel, with one surface at rest, "
+    "which only simulated scenes have."
 )
 
 

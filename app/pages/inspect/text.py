@@ -76,8 +76,9 @@ map *Goodness of fit* shows where it fails.
 MAP_HELP = (
     "Quantity shown on the map. Peak: largest count of a pixel. Fired: share of pulses with a "
     "detection. SBR: estimated from the counts. Goodness of fit: p-value, below 0.05 in 5 % of the "
-    "pixels where the model holds. Returns: surfaces that each pixel shows by itself; 1 % of those "
-    "with one get a second. Reported: distance that the sensor itself found."
+    "pixels where the model holds. Returns: number found in each pixel without its neighbours; 1 % "
+    "of the pixels with one surface show a second by chance. Reported: distance that the sensor "
+    "found."
 )
 MODE_HELP = (
     "What dragging on the map does: zoom, select a region by a rectangle or a lasso, or draw the "
@@ -169,7 +170,7 @@ def _velocity_facts(answer: Answer, pixel: Pixel) -> list[Fact]:
     if velocity is None or not answer.run.image.valid[row, col]:
         return []
     help = "Radial velocity with its 95 % interval; positive if the surface recedes."
-    return [("Velocity", velocity.text_at(row, col), help)]
+    return [("Velocity", velocity.text_at(row, col).replace("-", "−"), help)]
 
 
 def _region_facts(found: Inspected, unit: str) -> list[Fact]:

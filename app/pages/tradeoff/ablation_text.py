@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection
 
 from app.model.text import Cell, cell, interval_cell, percent_cell
-from core.studies.ablation import NOTE, TITLES, Requirement
+from core.studies.ablation import COMPARISON_NOTE, KINDS_NOTE, TITLES, Requirement
 
 __all__ = ["COLUMNS", "EXPLANATION", "NOTE", "TITLE", "row", "subject"]
 
@@ -22,6 +22,8 @@ The likelihood is also compared with its extensions: the evidence of neighbourin
 posterior), the search for a second return of each pixel, and the search for a velocity. These are
 choices of the estimator; a second surface and motion are parts of the scene.
 """
+
+NOTE = f"{KINDS_NOTE} {COMPARISON_NOTE}"
 
 COLUMNS = (
     ("Part, correction or extension", "What is judged, and why it is needed or not.", 1),
@@ -41,7 +43,7 @@ COLUMNS = (
     ("Pixels", "Share of pixels whose pulses resolve the change.", -1),
     ("RD", "Share of targets within 3 bins: with minus without; 95 % interval.", -1),
     ("RMSE (m)", "With minus without; 95 % interval.", 1),
-    ("Time", "With divided by without; 95 % interval.", -1),
+    ("Time ratio", "With divided by without; 95 % interval.", -1),
 )
 
 

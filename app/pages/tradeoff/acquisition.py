@@ -78,7 +78,7 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         )
         self._results[:] = [curves, self._required.layout]
         controls = self.controls(*self.study.controls)
-        return [self.subject, self._results], part("Simulation", controls)
+        return [self.subject, self._results], part("Acquisition", controls)
 
     def show(self, is_on_screen: bool) -> None:
         """Come on screen, or leave it; the first simulation starts by itself."""

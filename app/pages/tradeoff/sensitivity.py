@@ -30,12 +30,12 @@ METHODS = {METHOD_TITLES[method]: method for method, *_ in numbers()}
 
 CARDS = """
 :host {{ display: grid !important; gap: 8px; flex: none !important; height: {wide}px !important;
-  grid-template-columns: repeat(2, minmax(0, 1fr)); grid-auto-rows: 300px; }}
+  grid-template-columns: repeat(2, minmax(0, 1fr)); grid-auto-rows: 330px; }}
 @media screen and (max-width: 1100px) {{
   :host {{ grid-template-columns: minmax(0, 1fr); height: {narrow}px !important; }}
 }}
 """
-ROW_PX = 308
+ROW_PX = 338
 
 
 @dataclass(frozen=True)

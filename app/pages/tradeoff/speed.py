@@ -26,7 +26,7 @@ from app.pages.tradeoff import text
 from app.plots import elements as plots
 from app.tasks.scheduler import Work
 from app.theme import LIGHT, palette
-from app.widgets.cards import card, part
+from app.widgets.cards import BREAK_PX, card, part, unrolled
 from app.widgets.controls import Sentence, SettingsPanel, Table
 from app.widgets.figures import paint_frame, pane_of
 from core.cost import predicted
@@ -134,6 +134,7 @@ class SpeedSection(SettingsSection[Effort]):
         """Return sentences, plot and table, and the controls."""
         plot = pn.Column(
             self.offer(card(pane_of(self.plot.figure)), "plot", self._shown),
+            stylesheets=[unrolled(BREAK_PX)],
             sizing_mode="stretch_width",
             height=PLOT_HEIGHT,
             margin=0,

@@ -51,7 +51,7 @@ COLUMNS = (
     ("RMSE (m)", "Root mean square error, with its 95 % interval.", 1),
     ("Time (ms)", "Per image: median of the rounds, with its 95 % interval.", 1),
     ("Flux (ms)", "Time to estimate the fluxes, once per capture.", 1),
-    ("ns", "Time per pixel and bin of the whole image.", 1),
+    ("Per bin (ns)", "Time per pixel and bin of the whole image.", 1),
     ("Memory (MB)", "Largest size of all arrays at once, without the capture.", 1),
 )
 

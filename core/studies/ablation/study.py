@@ -238,17 +238,22 @@ RULE_OF_CAPTURES = (
     f"needed if it improves estimates by more than {MARGIN_RD:g} in RD or half a bin in RMSE."
 )
 
-NOTE = (
+KINDS_NOTE = (
     "Corrections undo what a simpler estimator ignores; extensions go beyond one pixel by itself, "
-    "with one surface at rest; parts belong to the scene. "
-    "Total variation: how far the part, or what the correction corrects, changes the trigger "
-    "probabilities of a pulse, mean over the pixels and in the worst. Detectable from: total "
-    "variation that the pulses of one pixel reveal with errors of 5 %. Effect: estimated from all "
-    "pixels of a capture, in the unit that the reason states. Seen from: effect that would have "
-    f"been seen with a probability of {POWER:.0%}. RD within 3 bins, RMSE and time compare with "
-    "and without it, with 95 % intervals; time is that of simulating for a part, otherwise of "
-    f"ranging, for an extension with its flux model. Extensions are judged by {EXTENDED_CAPTURES} "
-    "captures of a scene. For the search for a second return, RD is the share of all surfaces that "
-    "are found, where a return more than there are surfaces counts as one that is not, and the "
-    "RMSE is that of the return nearest to each surface."
+    "with one surface at rest; parts belong to the scene."
+)
+COMPARISON_NOTE = (
+    "RD within 3 bins, RMSE and time compare with and without it, with 95 % intervals; time is "
+    "that of simulating for a part, otherwise of ranging, for an extension with its flux model. "
+    f"Extensions are judged by {EXTENDED_CAPTURES} captures of a scene. For the search for a "
+    "second return, RD is the share of all surfaces that are found, where a return more than there "
+    "are surfaces counts as one that is not, and the RMSE is that of the return nearest to each "
+    "surface."
+)
+NOTE = (
+    f"{KINDS_NOTE} Total variation: how far the part, or what the correction corrects, changes the "
+    "trigger probabilities of a pulse, mean over the pixels and in the worst. Detectable from: "
+    "total variation that the pulses of one pixel reveal with errors of 5 %. Effect: estimated "
+    "from all pixels of a capture, in the unit that the reason states. Seen from: effect that "
+    f"would have been seen with a probability of {POWER:.0%}. {COMPARISON_NOTE}"
 )

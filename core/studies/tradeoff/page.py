@@ -346,7 +346,7 @@ def acquisition_items(sweeps: Sequence[AcquisitionSweeps]) -> Iterator[Item]:
             (
                 "exposure",
                 exposure,
-                f"Factor on signal and background ({n_pulses}; attenuated below 1)",
+                f"Factor on both fluxes ({n_pulses})",
                 best,
             ),
             (
@@ -378,7 +378,7 @@ def _sweep_plot(
     }
     return Plot(
         _key(name, source, sbr),
-        f"{_subject(source, sbr)}: restoration degree against {name}",
+        f"Restoration degree against {name}: {_subject(source, sbr)}",
         x_label,
         "Restoration degree within 3 bins",
         sweep.x,
