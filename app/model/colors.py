@@ -93,7 +93,7 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
 
 
 def doubt(answer: Answer) -> str:
-    """Return why confidences are not to be relied on; empty unless known (`has_fit`)."""
+    """Return why confidences are unreliable; empty unless known (`has_fit`)."""
     if answer.follows_motion:
         return ""  # the fit is that of surfaces at rest
     misfit = fit_of(answer.capture).remark if has_fit(answer.capture) else ""

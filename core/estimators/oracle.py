@@ -25,8 +25,9 @@ def true_flux_model(capture: Capture) -> FluxModel:
     """
     if capture.signal is None or capture.background is None:
         raise ValueError(
-            "method = 'oracle' needs the true signal and background, which only a simulated "
-            "capture knows: take 'likelihood', which estimates them."
+            "method = 'oracle' needs the true signal and background, which only a simulated scene "
+            "without further parts, such as fog, motion or a second surface, has: take "
+            "'likelihood', which estimates them."
         )
     target = capture.signal[capture.signal > 0]
     # For a pixel without a target, a typical echo is assumed.

@@ -87,7 +87,7 @@ class Fit(NamedTuple):
     @property
     def remark(self) -> str:
         """A clause on confidences; empty if the model fits."""
-        return "" if self.fits else f"confidences are not to be relied on: {self._reasons}"
+        return "" if self.fits else f"confidences are unreliable: {self._reasons}"
 
     @property
     def verdict(self) -> str:
@@ -148,7 +148,7 @@ def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
             background_deviation(capture, residuals),
         ),
         _check(
-            "echoes differ from the pulse by {:.1%} of it (another pulse, jitter or motion)",
+            "echoes differ by {:.1%} from the shape of the pulse (another pulse, jitter or motion)",
             pulse_deviation(capture, residuals),
         ),
         _pixels(_p_values(capture, residuals)),

@@ -152,7 +152,7 @@ def pulse_shape(capture: Capture) -> Requirement:
         "pulse_shape",
         pooled_evidence(capture).pulse,
         MARGIN_PULSE,
-        "echoes differ from the pulse by {} of it",
+        "echoes differ by {} from the shape of the pulse",
         explained=_second_signal(capture),
     )
 
