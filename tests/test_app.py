@@ -592,8 +592,20 @@ def test_a_change_by_the_user_is_reported_as_new_settings_and_one_by_the_page_is
 # -- the whole page --------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def one_layout():
+    return HeldLayout(built_in_sources())
+
+
 @pytest.fixture
-def layout():
+def layout(one_layout):
+    """The app on Explore, shared by tests that open no other page and make no models."""
+    one_layout.restart()
+    return one_layout
+
+
+@pytest.fixture
+def own_layout():
     return HeldLayout(built_in_sources())
 
 
@@ -617,7 +629,8 @@ def values_of(facts):
     return {name: value for name, value, _ in facts.facts}
 
 
-def test_a_page_is_complete(layout, explore):
+def test_a_page_is_complete(own_layout):
+    layout, explore = own_layout, own_layout.contents["Explore"]
     session = layout.session
     assert values_of(explore.figures)["RMSE"] == f"{session.answer.run.figures['rmse_m']:.4g} m"
     assert values_of(explore.numbers)["Pixel"] == "row {}, col {}".format(*session.state.pixel)
@@ -741,14 +754,14 @@ def opened(layout, title):
     return part
 
 
-def test_a_folded_part_is_built_when_it_is_first_opened(layout):
+def test_a_folded_part_is_built_when_it_is_first_opened(own_layout):
     names = [spec_of(each).symbol for each in fields(ReductionSettings)]
 
     def on_page():
-        return [each.label for each in layout.page.select(Knob) if each.label in names]
+        return [each.label for each in own_layout.page.select(Knob) if each.label in names]
 
     assert on_page() == []
-    part = opened(layout, "Data reduction")
+    part = opened(own_layout, "Data reduction")
     for collapsed in (False, True, False):
         part.collapsed = collapsed
         assert on_page() == names
@@ -890,7 +903,8 @@ def test_a_pixel_can_be_chosen_by_point_and_by_key(layout, explore):
     assert values_of(explore.numbers)["Pixel"] == "row 11, col 20"
 
 
-def test_a_page_off_screen_is_not_drawn_and_catches_up(layout, explore):
+def test_a_page_off_screen_is_not_drawn_and_catches_up(own_layout):
+    layout, explore = own_layout, own_layout.contents["Explore"]
     layout.pages.choice.value = "Inspect"
     before = explore.numbers.facts
     layout.session.choose_pixel(3, 4)
@@ -910,7 +924,8 @@ def test_hidden_estimates_leave_the_cloud_but_not_the_figures(layout, explore):
         assert values_of(explore.figures) == figures
 
 
-def test_points_of_the_cloud_are_pinned_and_measured(layout, explore):
+def test_points_of_the_cloud_are_pinned_and_measured(own_layout):
+    layout, explore = own_layout, own_layout.contents["Explore"]
     session, cloud, note = layout.session, explore.cloud, explore.measure.note
     explore.measure.part.collapsed = False
     places = np.argwhere(session.answer.run.image.confidence > 0.99)[[0, -1]]
@@ -1040,10 +1055,10 @@ def test_a_page_that_does_not_exist_is_refused_by_name():
     assert "page = 'Nowhere' is not accepted: give Explore, Inspect" in layout.alert.text
 
 
-def test_sessions_share_no_control_and_no_source(layout):
+def test_sessions_share_no_control_and_no_source(own_layout):
     other = Layout(built_in_sources())
-    knobs = [set(map(id, each.page.select(Knob))) for each in (layout, other)]
+    knobs = [set(map(id, each.page.select(Knob))) for each in (own_layout, other)]
     assert len(knobs[0]) == len(knobs[1]) > 0
     assert not knobs[0] & knobs[1]
-    layout.session.sources["mine"] = layout.session.sources["car"]
+    own_layout.session.sources["mine"] = own_layout.session.sources["car"]
     assert "mine" not in other.session.sources

@@ -1,4 +1,4 @@
-"""The Inspect page: pixel, region, pins and capture, on the 21 km capture and on the building."""
+"""The Inspect page: pixel, region, pins and capture, on the 21 km capture and on the car."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ def far(source):
 
 
 @pytest.fixture
-def building():
-    """A session on the simulated building."""
-    return Session({"building": built_in_sources()["building"]}, tasks=HeldTasks())
+def near():
+    """A session on the simulated car, whose gate is short: a region takes a second."""
+    return Session({"car": built_in_sources()["car"]}, tasks=HeldTasks())
 
 
 def on_screen(section, until=lambda section: section.found):
@@ -144,13 +144,14 @@ def test_zoom_along_the_gate_is_kept_until_the_bins_change(far):
 # -- map -------------------------------------------------------------------------------------------
 
 
-def test_a_file_opens_on_inspect_and_a_scene_on_explore(far, building):
-    assert (far.state.page, building.state.page) == ("Inspect", "Explore")
+def test_a_file_opens_on_inspect_and_a_scene_on_explore(far, near):
+    assert (far.state.page, near.state.page) == ("Inspect", "Explore")
 
 
-@pytest.mark.parametrize("name", ["far", "building"])
+@pytest.mark.parametrize("name", ["far", "near"])
 def test_every_map_is_offered_where_possible_and_drawn(name, request):
     session = request.getfixturevalue(name)
+    change(session, less=ReductionSettings(skip=4))
     capture = session.answer.capture
     offered = session.state.param.map.objects
     has_truth = capture.truth_range_m is not None
@@ -225,32 +226,32 @@ def test_a_drawn_region_becomes_a_short_polygon():
     assert mask[distance <= 9.8].all()
 
 
-def test_pixel_pins_and_region_are_kept_while_the_capture_keeps_its_pixels(far):
-    far.choose_pixel(100, 131)
-    far.state.param.update(pins=((100, 131),), region=rectangle((10, 20), (5, 8)))
-    kept = (far.state.pixel, far.state.pins, far.state.region)
+def test_pixel_pins_and_region_are_kept_while_the_capture_keeps_its_pixels(near):
+    near.choose_pixel(40, 31)
+    near.state.param.update(pins=((40, 31),), region=rectangle((10, 20), (5, 8)))
+    kept = (near.state.pixel, near.state.pins, near.state.region)
     for less in (ReductionSettings(gate_from=0.1), ReductionSettings(pulses=0.5)):
-        change(far, less=less)
-        assert (far.state.pixel, far.state.pins, far.state.region) == kept
-    change(far, less=ReductionSettings(pool=2))
-    assert (far.state.pins, far.state.region) == ((), ())
+        change(near, less=less)
+        assert (near.state.pixel, near.state.pins, near.state.region) == kept
+    change(near, less=ReductionSettings(pool=2))
+    assert (near.state.pins, near.state.region) == ((), ())
 
 
 # -- pixel and region ------------------------------------------------------------------------------
 
 
-def test_confidence_below_which_estimates_are_hidden_is_set_beside_the_map(building):
-    page = Inspect(building)
+def test_confidence_below_which_estimates_are_hidden_is_set_beside_the_map(near):
+    page = Inspect(near)
     page.show(True)
-    building.tasks.run_until(lambda: page.legend.text)
-    confidence = building.answer.run.image.confidence
+    near.tasks.run_until(lambda: page.legend.text)
+    confidence = near.answer.run.image.confidence
     for least in (0.5, 0.99):
         page.least_confidence.value = least
         said = f"{(confidence < least).sum():,} of {confidence.size:,} estimates hidden"
-        building.tasks.run_until(lambda said=said: said in page.legend.text)
-        assert building.state.viewing.least_confidence == least
-    building.state.viewing = replace(building.state.viewing, least_confidence=0.9)
-    building.tasks.run_until(lambda: page.least_confidence.value == 0.9)
+        near.tasks.run_until(lambda said=said: said in page.legend.text)
+        assert near.state.viewing.least_confidence == least
+    near.state.viewing = replace(near.state.viewing, least_confidence=0.9)
+    near.tasks.run_until(lambda: page.least_confidence.value == 0.9)
 
 
 def test_hot_and_dead_pixels_are_listed_marked_and_shown_by_a_press():
@@ -313,11 +314,11 @@ def test_the_image_posterior_shows_what_neighbours_tell():
     assert section.plots.below(section.found, "Score") is section.plots.score
 
 
-def test_everything_about_a_pixel_is_cores(building):
-    section = on_screen(PixelSection(building, "pixel"))
-    building.choose_pixel(40, 30)
-    building.tasks.run_until(lambda: values(section.facts).get("Pixel") == "40, 30")
-    capture, tracking = building.answer.capture, building.answer.request.tracking
+def test_everything_about_a_pixel_is_cores(near):
+    section = on_screen(PixelSection(near, "pixel"))
+    near.choose_pixel(40, 30)
+    near.tasks.run_until(lambda: values(section.facts).get("Pixel") == "40, 30")
+    capture, tracking = near.answer.capture, near.answer.request.tracking
     signals = tracking_signals(capture.cube[40, 30], tracking, capture.gated_pulses)
     counts, rate, stages = section.plots.counts, section.plots.rate, section.plots.stages
     for plot, name, expected in (
@@ -329,7 +330,7 @@ def test_everything_about_a_pixel_is_cores(building):
         (stages, "enhanced", signals.enhanced),
     ):
         np.testing.assert_allclose(plot.curve(name), expected, rtol=1e-5, atol=1e-6, err_msg=name)
-    image = building.answer.run.image
+    image = near.answer.run.image
     report = inspection.pixel_report(capture, image, 40, 30, "tracking", tracking)
     n_bins = capture.acquisition.n_bins
     for button, column, expected in (
@@ -368,26 +369,26 @@ def test_a_file_without_truth_has_no_error(far):
     assert section.plots.counts.figure.title.text_color == DARK.text
 
 
-def test_a_region_shows_the_sum_of_its_histograms(building):
-    section = on_screen(PixelSection(building, "region"), lambda each: each.remark.text)
+def test_a_region_shows_the_sum_of_its_histograms(near):
+    section = on_screen(PixelSection(near, "region"), lambda each: each.remark.text)
     assert section.remark.text == text.NO_REGION
     assert not any(each.visible for each in section.cards)
-    building.state.region = rectangle((40, 44), (30, 33))
-    building.tasks.run_until(lambda: section.found)
-    summed = building.answer.capture.cube[40:45, 30:34].sum(axis=(0, 1))
+    near.state.region = rectangle((40, 44), (30, 33))
+    near.tasks.run_until(lambda: section.found)
+    summed = near.answer.capture.cube[40:45, 30:34].sum(axis=(0, 1))
     np.testing.assert_allclose(section.plots.counts.curve("raw"), summed)
     facts = values(section.facts)
     assert facts["Pixels"] == "20"
-    image = building.answer.run.image.range_m[40:45, 30:34]
-    expected = inspect_region(building.answer, building.state.region)
+    image = near.answer.run.image.range_m[40:45, 30:34]
+    expected = inspect_region(near.answer, near.state.region)
     # With two digits of the spread.
     decimals = 1 - math.floor(math.log10(expected.region.spread_m))
     assert facts["Median range"] == f"{np.nanmedian(image):.{decimals}f} m"
     assert facts["SBR"] == text.interval(expected.region.flux.sbr)
     assert section.remark.text.startswith(expected.region.fit.verdict)
     visible = [each.visible for each in section.cards]
-    building.state.plot = "Fit"
-    building.tasks.run_until(lambda: section.plots.residuals.curve("deviation").size)
+    near.state.plot = "Fit"
+    near.tasks.run_until(lambda: section.plots.residuals.curve("deviation").size)
     shown = [each.visible for each in section.cards]
     assert shown[0] and sum(shown) == sum(visible) == 2 and shown != visible
     predicted = predict(expected).counts
@@ -398,22 +399,22 @@ def test_a_region_shows_the_sum_of_its_histograms(building):
     np.testing.assert_array_equal(table["expected (fit) (counts)"][:n_bins], predicted.expected)
     saved = table_of(section, "residuals of the fit")["residual"][:n_bins]
     np.testing.assert_array_equal(saved, predicted.residual)
-    building.state.region = ((0.1, 0.1), (0.1, 0.2), (0.2, 0.2))
-    building.tasks.run_until(lambda: section.found is None)
+    near.state.region = ((0.1, 0.1), (0.1, 0.2), (0.2, 0.2))
+    near.tasks.run_until(lambda: section.found is None)
     assert "0 pixels" in section.remark.text
     assert not section.facts.facts
 
 
-def test_pixel_region_pins_profile_and_files_follow_the_method(building):
+def test_pixel_region_pins_profile_and_files_follow_the_method(near):
     region, pins = rectangle((40, 44), (30, 33)), ((40, 30), (41, 31))
     cfar = core.ESTIMATORS["cfar"].parameters(guard_bins=5)
-    building.state.param.update(region=region, pins=pins, pixel=(40, 30))
-    change(building, method="cfar", settings={**building.state.settings, "cfar": cfar})
-    answer = building.answer
+    near.state.param.update(region=region, pins=pins, pixel=(40, 30))
+    change(near, method="cfar", settings={**near.state.settings, "cfar": cfar})
+    answer = near.answer
     capture, image = answer.capture, core.estimate(answer.capture, "cfar", cfar)
     np.testing.assert_array_equal(answer.run.image.range_m, image.range_m)
-    pixel = on_screen(PixelSection(building, "pixel"))
-    summed = on_screen(PixelSection(building, "region"))
+    pixel = on_screen(PixelSection(near, "pixel"))
+    summed = on_screen(PixelSection(near, "region"))
     at = inspection.pixel_report(capture, image, 40, 30, "cfar", cfar)
     inside = inspection.pixels_in(region, capture.shape)
     of_sum = inspection.region_report(capture, image, inside, "cfar", cfar)
@@ -424,10 +425,10 @@ def test_pixel_region_pins_profile_and_files_follow_the_method(building):
         np.testing.assert_allclose(section.plots.score.curve("score"), report.curve, rtol=1e-5)
         saved = section.downloads["score"]()
         assert f"settings: {cfar}" in " ".join(saved.subject.lines(saved.what))
-    pinned = on_screen(PinsSection(building))
+    pinned = on_screen(PinsSection(near))
     scores = [core.ESTIMATORS["cfar"].curves(capture, *pin, cfar) for pin in pins]
     np.testing.assert_allclose(pinned.score.source("lines").data["ys"], scores, rtol=1e-5)
-    along = on_screen(ProfileSection(building)).plot.source("points").data
+    along = on_screen(ProfileSection(near)).plot.source("points").data
     at_ends = [image.confident(0.9).range_m[pin] for pin in pins]
     np.testing.assert_array_equal([along["range"][0], along["range"][-1]], at_ends)
 
@@ -468,13 +469,13 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
 # -- profile and crop ------------------------------------------------------------------------------
 
 
-def test_a_profile_runs_through_the_pins_and_is_saved_as_shown(building):
+def test_a_profile_runs_through_the_pins_and_is_saved_as_shown(near):
     pins = ((20, 10), (45, 50))
-    building.state.param.update(page="Inspect", subject="Profile", pins=pins)
-    building.state.light = Illumination(sbr=0.5)
-    building.tasks.run_until(building.is_settled)
-    section = on_screen(ProfileSection(building))
-    answer, viewing = building.answer, building.state.viewing
+    near.state.param.update(page="Inspect", subject="Profile", pins=pins)
+    near.state.light = Illumination(sbr=0.5)
+    near.tasks.run_until(near.is_settled)
+    section = on_screen(ProfileSection(near))
+    answer, viewing = near.answer, near.state.viewing
     assert section.view.main
     expected = profile_of(answer, pins, viewing)
     shown = section.plot.source("points").data
@@ -500,15 +501,15 @@ def test_a_profile_runs_through_the_pins_and_is_saved_as_shown(building):
         viewing, field_of_view_deg=2 * answer.own_field_of_view_deg, least_confidence=1.0
     )
     before = section.found
-    building.state.viewing = wider
-    building.tasks.run_until(lambda: section.found is not before)
+    near.state.viewing = wider
+    near.tasks.run_until(lambda: section.found is not before)
     hidden = int((answer.run.image.confidence[expected.row, expected.col] < 1).sum())
     assert f"{hidden} without a range, or hidden." in section.note.text
-    link = link_to(building.query())
-    again = Session(building.sources, link, tasks=HeldTasks()).state
+    link = link_to(near.query())
+    again = Session(near.sources, link, tasks=HeldTasks()).state
     assert (again.subject, again.pins, again.viewing) == ("Profile", pins, wider)
-    assert "core.inspection.line_profile(" in script_of(answer, building.state)
-    building.state.pins = pins[:1]
+    assert "core.inspection.line_profile(" in script_of(answer, near.state)
+    near.state.pins = pins[:1]
     assert (section.note.text, section.found) == (text.NO_PROFILE, None)
     with pytest.raises(ValueError, match="nothing is drawn here yet"):
         section.downloads["profile"]()
@@ -533,23 +534,23 @@ def test_lengths_rest_on_a_guess_unless_the_user_sets_the_field_of_view(far):
     assert far.state.crop == Crop()  # the limits were those of another scene
 
 
-def test_the_box_says_what_is_inside_refuses_crossed_limits_and_is_in_the_link(building):
-    page = Inspect(building)
+def test_the_box_says_what_is_inside_refuses_crossed_limits_and_is_in_the_link(near):
+    page = Inspect(near)
     page.show(True)
-    crop, image = page.crop, building.answer.run.image
+    crop, image = page.crop, near.answer.run.image
     n_shown = int((image.confidence >= 0.9).sum())
     crop.settings.controls["to_m"].value = 840.0
-    assert building.state.crop == Crop(to_m=840.0)
+    assert near.state.crop == Crop(to_m=840.0)
     n_inside = int(((image.confidence >= 0.9) & (image.range_m <= 840)).sum())
     assert crop.note.text.startswith(f"{n_inside:,} of {n_shown:,} points are inside")
     crop.settings.controls["from_m"].value = 850.0
     assert "a number above Range from = 850" in crop.settings.doubts.text
-    assert building.state.crop == Crop(to_m=840.0)
+    assert near.state.crop == Crop(to_m=840.0)
     crop.settings.controls["from_m"].value = None
     crop.settings.controls["pixels"].value = "region"
     assert crop.note.text == NO_REGION
-    link = link_to(building.query())
-    again = Session(building.sources, link, tasks=HeldTasks()).state
+    link = link_to(near.query())
+    again = Session(near.sources, link, tasks=HeldTasks()).state
     assert again.crop == Crop("region", None, 840.0)
 
 
@@ -563,24 +564,24 @@ def test_each_doubt_about_a_and_b_is_stated_once():
     assert text.pair_doubts("", "Tail.", "") == "B: Tail."
 
 
-def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, monkeypatch):
-    section, sources = PairSection(building), building.sources
+def test_an_estimate_is_kept_and_subtracted_from_another(near, tmp_path, monkeypatch):
+    section, sources = PairSection(near), near.sources
     section.show(True)
     assert section.note.text == text.NO_A
-    building.state.param.update(light=Illumination(sbr=0.3), tracking=TrackingParameters(l=0.006))
-    building.tasks.run_until(building.is_settled)
-    a = building.answer
+    near.state.param.update(light=Illumination(sbr=0.3), tracking=TrackingParameters(l=0.006))
+    near.tasks.run_until(near.is_settled)
+    a = near.answer
     press(button(section, "Keep as A"))
-    change(building, method="coates")
+    change(near, method="coates")
     section.refresh()
-    building.tasks.run_until(lambda: section.pair and section.pair.b is building.answer)
-    image_a, image_b = a.run.image, building.answer.run.image
+    near.tasks.run_until(lambda: section.pair and section.pair.b is near.answer)
+    image_a, image_b = a.run.image, near.answer.run.image
     shown = [each.valid & (each.confidence >= 0.9) for each in (image_a, image_b)]
     difference_m = np.where(shown[0] & shown[1], image_b.range_m - image_a.range_m, np.nan)
     assert section.pair.a is a
     np.testing.assert_array_equal(section.pair.difference_m, difference_m)
     numbers = values(section.facts)
-    pixel = building.state.pixel
+    pixel = near.state.pixel
     for name, image in (("A here", image_a), ("B here", image_b)):
         assert numbers[name].value == image.range_m[pixel]
         assert (" ± " in numbers[name]) == (image.confidence[pixel] >= 0.9)
@@ -595,16 +596,16 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
         assert hidden in picture.caption.text
     assert f"{np.isnan(difference_m).sum():,} pixels" in section.difference.caption.text
     # The script computes both.
-    building.state.param.update(page="Inspect", subject="A/B")
+    near.state.param.update(page="Inspect", subject="A/B")
     monkeypatch.chdir(tmp_path)
-    script = script_of(building.answer, building.state, building.kept_answer)
+    script = script_of(near.answer, near.state, near.kept_answer)
     (tmp_path / "script.py").write_text(script, "utf-8")
     scripted = runpy.run_path("script.py")
     np.testing.assert_array_equal(scripted["difference_m"], difference_m)
     np.testing.assert_array_equal(scripted["image"].range_m, image_b.range_m)
     assert script.count("core.simulate") == 1
     # Another session has only the link, and computes A again.
-    link = link_to(building.query())
+    link = link_to(near.query())
     again = PairSection(Session(sources, link, tasks=HeldTasks()))
     again.show(True)
     again.session.tasks.run_until(lambda: again.pair)
@@ -613,11 +614,11 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
     assert has_fit(again.pair.a.capture) and has_fit(again.pair.b.capture)  # for the legends
     same = script_of(again.session.answer, again.session.state, again.session.kept_answer)
     assert same == script
-    kept = building.state.kept
+    kept = near.state.kept
     press(button(section, "Forget A"))
-    assert section.note.text == text.NO_A and building.state.kept == ""
-    building.state.kept = kept  # as by Undo
-    assert building.kept_answer is None  # A does not stay in memory
+    assert section.note.text == text.NO_A and near.state.kept == ""
+    near.state.kept = kept  # as by Undo
+    assert near.kept_answer is None  # A does not stay in memory
 
 
 def test_two_captures_are_subtracted_and_the_script_reads_both(tmp_path, monkeypatch):
@@ -644,15 +645,15 @@ def test_two_captures_are_subtracted_and_the_script_reads_both(tmp_path, monkeyp
     np.testing.assert_array_equal(found, section.pair.difference_m)
 
 
-def test_estimates_of_other_sizes_are_not_subtracted(building):
-    section = PairSection(building)
+def test_estimates_of_other_sizes_are_not_subtracted(near):
+    section = PairSection(near)
     section.show(True)
     press(button(section, "Keep as A"))
-    change(building, less=ReductionSettings(pool=2))
+    change(near, less=ReductionSettings(pool=2))
     section.refresh()
-    building.tasks.run_until(lambda: "their sizes must be equal" in section.note.text)
+    near.tasks.run_until(lambda: "their sizes must be equal" in section.note.text)
     assert section.pair is None
-    building.state.kept = "source=gone"
+    near.state.kept = "source=gone"
     assert "There is no scene or capture 'gone'" in section.note.text
 
 
@@ -664,7 +665,7 @@ def table_of(section, button):
     return columns_of(written(section.downloads[button]().files["csv"]))
 
 
-@pytest.mark.parametrize("name", ["far", "building"])
+@pytest.mark.parametrize("name", ["far", "near"])
 def test_region_pins_and_capture_are_saved_as_shown(name, request):
     session = request.getfixturevalue(name)
     pins, region = ((10, 30), (61, 62)), rectangle((40, 44), (30, 33))
@@ -696,11 +697,11 @@ def test_region_pins_and_capture_are_saved_as_shown(name, request):
     )
 
 
-def test_an_outdated_region_is_not_saved(building):
-    section = on_screen(PixelSection(building, "region"), lambda each: each.remark.text)
-    building.state.region = rectangle((40, 44), (30, 33))
-    building.tasks.run_until(lambda: section.found)
-    building.state.region = rectangle((1, 2), (3, 4))  # drawn when the test lets it
+def test_an_outdated_region_is_not_saved(near):
+    section = on_screen(PixelSection(near, "region"), lambda each: each.remark.text)
+    near.state.region = rectangle((40, 44), (30, 33))
+    near.tasks.run_until(lambda: section.found)
+    near.state.region = rectangle((1, 2), (3, 4))  # drawn when the test lets it
     with pytest.raises(ValueError, match="nothing is drawn here yet"):
         section.downloads["counts"]()
 
@@ -709,19 +710,19 @@ def test_an_outdated_region_is_not_saved(building):
 
 
 @pytest.fixture
-def capture(building):
+def capture(near):
     """The section on the capture as a whole, its study cancelled."""
-    section = CaptureSection(building)
-    building.estimate.changed.subscribe(section.follow)
+    section = CaptureSection(near)
+    near.estimate.changed.subscribe(section.follow)
     section.show(True)
     buttons, *_ = section.study.controls
     press(buttons[1])
-    building.tasks.run_until(lambda: section.report)
+    near.tasks.run_until(lambda: section.report)
     return section
 
 
-def test_the_capture_is_reported_and_suggestions_apply(capture, building):
-    report, before = capture.report, building.answer.capture
+def test_the_capture_is_reported_and_suggestions_apply(capture, near):
+    report, before = capture.report, near.answer.capture
     np.testing.assert_allclose(capture.counts.curve("raw"), before.cube.sum(axis=(0, 1)))
     facts = values(capture.facts)
     for pixels, flux in (("all", report.flux), ("target", report.target_flux)):
@@ -729,12 +730,12 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
         assert facts[f"PPP, {pixels} pixels"] == text.interval(flux.signal)
     assert facts["Hot pixels"] == str(report.n_hot)
     check = inspection.StatedFluxCheck("sbr", "", 2 * report.flux.sbr.value, report.flux.sbr)
-    stated = text.capture_facts(building.answer, replace(report, stated=(check,)))
+    stated = text.capture_facts(near.answer, replace(report, stated=(check,)))
     (shown,) = (value for name, value, _ in stated if name == "SBR, stated")
     assert shown.value == check.stated and shown.note == "estimate −50.0 %"
     unknown = replace(before, acquisition=replace(before.acquisition, n_pulses=None))
-    run = replace(building.answer.run, capture=unknown)
-    named = text.capture_facts(replace(building.answer, run=run), report)
+    run = replace(near.answer.run, capture=unknown)
+    named = text.capture_facts(replace(near.answer, run=run), report)
     assert "Photons per pixel, all pixels" in [name for name, *_ in named]
     assert report.flux_method in capture.flux.text
     assert report.flux_remark in capture.flux.text
@@ -743,15 +744,15 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
 
     apply_gate, apply_t_n = capture.apply
     press(apply_gate)
-    building.tasks.run_until(lambda: capture.report is not report)
+    near.tasks.run_until(lambda: capture.report is not report)
     first, end = report.suggestion.gate
-    gate = building.answer.capture.acquisition
+    gate = near.answer.capture.acquisition
     assert gate.n_bins == end - first
     opens_s = before.acquisition.gate_delay_s + first * gate.bin_width_s
     assert gate.gate_delay_s == pytest.approx(opens_s)
     press(apply_t_n)
-    assert building.state.tracking.t_n == capture.report.suggestion.t_n
-    building.tasks.run_until(lambda: apply_t_n.disabled)
+    assert near.state.tracking.t_n == capture.report.suggestion.t_n
+    near.tasks.run_until(lambda: apply_t_n.disabled)
 
     def t_n_shown():
         shown = capture.report is not None and capture.advice[1].visible and apply_t_n.visible
@@ -759,51 +760,51 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
         return shown
 
     assert t_n_shown()
-    building.state.method = "likelihood"  # which has no T_n
-    building.tasks.run_until(lambda: not t_n_shown())
-    building.state.method = "tracking"
-    building.tasks.run_until(t_n_shown)
+    near.state.method = "likelihood"  # which has no T_n
+    near.tasks.run_until(lambda: not t_n_shown())
+    near.state.method = "tracking"
+    near.tasks.run_until(t_n_shown)
 
 
-def test_a_report_that_fails_removes_the_previous_one(capture, building, monkeypatch):
+def test_a_report_that_fails_removes_the_previous_one(capture, near, monkeypatch):
     shown = []
-    building.failures.shown.subscribe(shown.append)
+    near.failures.shown.subscribe(shown.append)
 
     def fail(_capture):
         raise MemoryError("no more")
 
     monkeypatch.setattr("core.inspection.capture_report", fail)
-    building.state.less = ReductionSettings(merge=2)
-    building.tasks.run_until(lambda: "MemoryError" in "".join(shown))
+    near.state.less = ReductionSettings(merge=2)
+    near.tasks.run_until(lambda: "MemoryError" in "".join(shown))
     assert capture.report is None
     assert capture.facts.facts == []
     assert {sentence.text for sentence in (capture.flux, *capture.advice)} == {""}
     assert all(each.disabled for each in capture.apply)
 
 
-def test_a_gate_is_applied_to_an_already_reduced_capture(building):
-    change(building, less=ReductionSettings(merge=2, gate_from=0.1))
-    answer = building.answer
-    suggestion = replace(inspection.capture_report(answer.capture).suggestion, gate=(4, 90))
+def test_a_gate_is_applied_to_an_already_reduced_capture(near):
+    change(near, less=ReductionSettings(merge=2, gate_from=0.1))
+    answer = near.answer
+    suggestion = replace(inspection.capture_report(answer.capture).suggestion, gate=(4, 40))
     less, t_n = with_gate(answer, suggestion)
     n_bins = answer.whole.acquisition.n_bins
     opens = round(0.1 * n_bins)
-    assert less.reduction(n_bins).gate == (opens + 8, opens + 180)
+    assert less.reduction(n_bins).gate == (opens + 8, opens + 80)
     assert less.merge == 2
     assert t_n == max(answer.request.tracking.t_n - 4, 0)
 
 
-def test_a_gate_of_another_capture_is_not_cut(building):
-    cut = Cut.of(building.answer, ReductionSettings())
-    before = building.state.less
-    building.cut_gate(replace(cut, n_bins=cut.n_bins + 1, wanted=(0, cut.n_bins + 1)))
-    assert building.state.less is before
-    building.cut_gate(replace(cut, wanted=(0, cut.n_bins // 2)))
-    assert building.state.less.gate(cut.n_bins) == (0, cut.n_bins // 2)
+def test_a_gate_of_another_capture_is_not_cut(near):
+    cut = Cut.of(near.answer, ReductionSettings())
+    before = near.state.less
+    near.cut_gate(replace(cut, n_bins=cut.n_bins + 1, wanted=(0, cut.n_bins + 1)))
+    assert near.state.less is before
+    near.cut_gate(replace(cut, wanted=(0, cut.n_bins // 2)))
+    assert near.state.less.gate(cut.n_bins) == (0, cut.n_bins // 2)
 
 
-def test_accuracy_against_pulses_is_drawn_step_by_step(building):
-    section = on_screen(CaptureSection(building), lambda each: len(each.accuracies) == 2)
+def test_accuracy_against_pulses_is_drawn_step_by_step(near):
+    section = on_screen(CaptureSection(near), lambda each: len(each.accuracies) == 2)
     drawn = section.accuracy.source("points").data
     assert drawn["pulses"] == [each.share * 1000 for each in section.accuracies]
     assert drawn["value"] == [each.within.value for each in section.accuracies]
@@ -818,29 +819,29 @@ def test_accuracy_against_pulses_is_drawn_step_by_step(building):
     assert saved["Pulses"][saved["present number"] == 1] == 1000
     assert "truth" in section.accuracy.figure.yaxis.axis_label
     section.pulses.value = 0.25
-    building.tasks.run_until(lambda: building.answer.capture.acquisition.n_pulses == 250)
+    near.tasks.run_until(lambda: near.answer.capture.acquisition.n_pulses == 250)
     np.testing.assert_allclose(section.accuracy.source("present").data["x"], 250)
     section.show(False)
 
 
-def test_an_estimate_for_an_earlier_setting_does_not_reset_the_slider(capture, building):
-    before = building.answer
+def test_an_estimate_for_an_earlier_setting_does_not_reset_the_slider(capture, near):
+    before = near.answer
     for share in (0.5, 0.25):
         capture.pulses.value = share
-    building.tasks.run_until(lambda: building.answer is not before)
-    earlier = replace(building.answer.request, less=ReductionSettings(pulses=0.5))
-    capture.follow(replace(building.answer, request=earlier))
-    assert (capture.pulses.value, building.state.less.pulses) == (0.25, 0.25)
+    near.tasks.run_until(lambda: near.answer is not before)
+    earlier = replace(near.answer.request, less=ReductionSettings(pulses=0.5))
+    capture.follow(replace(near.answer, request=earlier))
+    assert (capture.pulses.value, near.state.less.pulses) == (0.25, 0.25)
 
 
-def test_a_share_of_pulses_that_fails_is_reset(capture, building, monkeypatch):
+def test_a_share_of_pulses_that_fails_is_reset(capture, near, monkeypatch):
     def fail(request, *more):
         raise MemoryError
 
     monkeypatch.setattr("app.pages.shared.estimate.compute", fail)
     capture.pulses.value = 0.5
-    building.tasks.run_until(lambda: capture.pulses.value == 1.0)
-    assert building.state.less == ReductionSettings()
+    near.tasks.run_until(lambda: capture.pulses.value == 1.0)
+    assert near.state.less == ReductionSettings()
 
 
 def test_without_truth_accuracy_is_called_agreement(far):
@@ -858,10 +859,10 @@ def test_ranks_of_close_candidates_are_above_each_other():
     assert rows == [rows[0] - step * row for row in (0, 1, 0, 2, 0)]
 
 
-def test_a_line_drawn_on_the_map_pins_its_ends_and_bends_for_a_profile(building):
-    page, state = Inspect(building), building.state
+def test_a_line_drawn_on_the_map_pins_its_ends_and_bends_for_a_profile(near):
+    page, state = Inspect(near), near.state
     page.show(True)
-    _, cols = building.answer.capture.shape
+    _, cols = near.answer.capture.shape
     down = np.linspace(2.0, 40.0, 30)
     page.navigator.drawn.data = {"xs": [np.full(30, 5.2)], "ys": [down]}
     assert (state.pins, state.subject) == (((2, 5), (40, 5)), "Profile")

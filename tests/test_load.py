@@ -14,8 +14,8 @@ from tests.load import Bounds, Growth, Load, as_markdown, growth, load, server_m
 def test_all_sessions_are_answered_and_interactions_leave_no_memory():
     with serving() as address:  # of its own, since its memory is measured
         resident_mb = server_mb(address)
-        used = asyncio.run(load(address, resident_mb, sessions=3, seconds=1.5, forgotten_s=0.0))
-        grown = asyncio.run(growth(address, resident_mb, interactions=90, warm=40))
+        used = asyncio.run(load(address, resident_mb, sessions=2, seconds=1.5, forgotten_s=0.0))
+        grown = asyncio.run(growth(address, resident_mb, interactions=60, warm=30))
     assert used.troubles == grown.troubles == []
     assert used.latencies_s.size > 40
     assert used.session_mb <= Bounds().session_mb

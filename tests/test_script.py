@@ -143,7 +143,7 @@ STATES = {
     "&tracking.start=zero&image=Error&viewing.least_confidence=0.4"
     "&viewing.color_from_m=48&viewing.color_map=viridis&difference=true&pixel=[3,17]",
     "larger": "source=car_256&less.skip=3&image=Counts&absent=[%22signal_levels%22]",
-    "inspected": "source=building&page=Inspect&map=SBR&plot=Fit&pins=[[1,2],[30,41]]&pixel=[12,13]"
+    "inspected": "source=car&page=Inspect&map=SBR&plot=Fit&pins=[[1,2],[30,41]]&pixel=[12,13]"
     "&region=[[20,20],[20,50],[50,35.5]]&crop.pixels=region&crop.from_m=1"
     "&absent=[%22pulse_shape%22,%22reflectivity%22]",
     "another method": "source=sample&page=Inspect&method=likelihood&subject=Profile"

@@ -276,8 +276,14 @@ sys.exit(main(["--port", "0"]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("only", ["tracking", None])  # before the first page, and meanwhile
+@pytest.mark.parametrize(
+    ("only", "number"),
+    [
+        ("tracking", signal.SIGINT),  # before the first page
+        ("tracking", signal.SIGTERM),
+        (None, signal.SIGTERM),  # meanwhile, when both have one handler
+    ],
+)
 def test_what_ends_the_app_does_so_while_kernels_are_compiled(only, number):
     with run("-c", COMPILING.format(only=only)) as server:
         while next(server.stdout) != "compiling\n":

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import expect
 
 from app.model.state import Illumination, ReductionSettings
-from app.model.store import built_in_sources
+from app.model.store import built_in_sources, scene_source
 from app.pages.layout import CUSTOM, Layout
 from app.pages.session import Session
 from app.pages.shared.section import Repetitions
@@ -42,19 +42,24 @@ def never():
     return False
 
 
+def small_sources():
+    """Built-in scenes and captures after one of few pixels, which is studied in less time."""
+    return {"small": scene_source("Few pixels", "staircase", size=24)} | built_in_sources()
+
+
 @pytest.fixture
 def session():
-    """A session on the car, its page's thread in the hands of the test."""
-    return Session(built_in_sources(), tasks=HeldTasks())
+    """A session on few pixels, its page's thread in the hands of the test."""
+    return Session(small_sources(), tasks=HeldTasks())
 
 
 @pytest.fixture(scope="module")
 def found():
-    """A small study of the car, after its request and its effort.
+    """A small study of few pixels, after its request and its effort.
 
     Its times are 1, 2, ... ms: measured ones depend on what else the machine does.
     """
-    section = SpeedSection(Session(built_in_sources()))
+    section = SpeedSection(Session(small_sources()))
     section.change(Effort(repetitions=2, repeats=6, merges="none"))
     *asked, points = section.work()(ignored, never)
     timed = [
@@ -84,7 +89,7 @@ class Piece:
 
     def __init__(self, draw=None):
         self.leave, self.drawn, self.shown = threading.Event(), [], []
-        session = Session(built_in_sources())
+        session = Session(small_sources())
         session.failures.shown.subscribe(self.shown.append)
         self.piece = OnePiece(session, lambda: self.work, draw or self.drawn.append, "steps")
 
@@ -196,7 +201,7 @@ def test_another_capture_makes_the_study_outdated(section, session):
 
 
 def test_opening_the_papers_method_sets_the_sliders(measured):
-    layout = Layout(built_in_sources())
+    layout = Layout(small_sources())
     (point,) = (p for p in measured if p.candidate.method.estimator == "tracking")
     merged = replace(point.candidate, reduction=ReductionSettings(merge=2).reduction(100))
     measured_on = layout.session.answer.request
@@ -204,7 +209,7 @@ def test_opening_the_papers_method_sets_the_sliders(measured):
     layout.session.state.param.update(light=changed, source="staircase", page="Trade-off")
     show_point(layout.session, replace(point, candidate=merged), measured_on)
     state = layout.session.state
-    assert (state.source, state.light) == ("car", Illumination())
+    assert (state.source, state.light) == ("small", Illumination())
     assert (state.less, state.tracking) == (ReductionSettings(merge=2), merged.settings)
     assert layout.pages.choice.value == "Explore"
     assert control(layout, "SBR").value == Illumination().sbr
@@ -213,7 +218,7 @@ def test_opening_the_papers_method_sets_the_sliders(measured):
 
 
 def test_any_method_is_shown_on_explore(measured):
-    layout = Layout(built_in_sources())
+    layout = Layout(small_sources())
     (point,) = (p for p in measured if p.candidate.method.estimator == "cfar")
     settings = replace(point.candidate.settings, guard_bins=9)
     method = replace(point.candidate.method, settings=settings)
@@ -251,8 +256,6 @@ def test_the_simulation_can_be_cancelled(session):
 
 @pytest.fixture
 def ablation(session):
-    """The ablation of a car seen by a worn instrument."""
-    change(session, source="worn")
     section = AblationSection(session)
     section.change(Repetitions())
     session.estimate.changed.subscribe(section.follow)
@@ -264,6 +267,7 @@ def rows_of(section):
 
 
 def test_parts_and_corrections_are_switched_off_and_on(ablation, session):
+    change(session, source="worn")  # a car seen by a worn instrument
     names, before = ("faulty_pixels", "pile_up"), session.answer.capture
     assert rows_of(ablation).keys() >= {*parts_of(session.answer.request.source.scene()), *names}
     for name in names:

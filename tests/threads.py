@@ -62,6 +62,7 @@ class HeldLayout(Layout):
     ) -> None:
         self.tasks = HeldTasks()
         super().__init__(sources, wanted, uploads, self.tasks, arrivals)
+        self._own_sources = frozenset(self.session.sources)
         self.heard = [""]
         self.session.failures.shown.subscribe(self.heard.append)
         self._answers: list[Answer] = []
@@ -73,6 +74,15 @@ class HeldLayout(Layout):
         while len(self._answers) == before:
             self.tasks.run_one()
         return self._answers[-1]
+
+    def restart(self) -> None:
+        """Return to what the page showed first: building it again would take a second."""
+        self.session.recall("")
+        self.tasks.run_until(self.session.is_settled)
+        self.settle()
+        for key in self.session.sources.keys() - self._own_sources:
+            del self.session.sources[key]
+        self.heard[:] = [""]
 
     def settle(self) -> None:
         """Let the page do all that is waiting now."""

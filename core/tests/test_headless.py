@@ -11,7 +11,9 @@ from pathlib import Path
 import core
 
 PACKAGE = Path(core.__file__).parent
-SOURCES = sorted(path for path in PACKAGE.rglob("*.py") if "tests" not in path.parts)
+SOURCES = sorted(
+    path for path in PACKAGE.rglob("*.py") if "tests" not in path.relative_to(PACKAGE).parts
+)
 SCREEN = {"app", "bokeh", "holoviews", "panel", "panel_material_ui", "param", "pyvista", "vtk"}
 
 SLOW_TO_LOAD = ("dask", "h5py", "matplotlib", "PIL", "trimesh", "xarray", "zarr")

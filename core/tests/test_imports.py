@@ -45,7 +45,9 @@ def imported_names(path: Path) -> Iterator[tuple[str, str]]:
 
 def sources(package: Path) -> list[Path]:
     """Source files of a package without its tests."""
-    return sorted(path for path in package.rglob("*.py") if "tests" not in path.parts)
+    return sorted(
+        path for path in package.rglob("*.py") if "tests" not in path.relative_to(package).parts
+    )
 
 
 def room_of(module: str, name: str = "") -> str:

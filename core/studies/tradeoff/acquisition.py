@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import logit
+import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats, Flux
 from core.inference.limits import best_exposure, right_bin_probability
@@ -179,7 +178,7 @@ def pulses_by_theory(simulation: Simulation, rd: float) -> float:
     most = math.log(_MAX_PULSES)
     if excess(most) < 0:
         return math.inf
-    return math.exp(brentq(excess, 0.0, most, xtol=1e-3)) if excess(0.0) < 0 else 1.0
+    return math.exp(scipy.optimize.brentq(excess, 0.0, most, xtol=1e-3)) if excess(0.0) < 0 else 1.0
 
 
 def pulses_by_simulation(found: Sweep, method: str, rd: float) -> Interval:
@@ -197,8 +196,8 @@ def pulses_by_simulation(found: Sweep, method: str, rd: float) -> Interval:
             return math.inf
         behind = int(np.argmax(rising >= rd))
         pair = slice(behind - 1, behind + 1)
-        odds = logit(np.clip(rising[pair], 1e-9, 1 - 1e-9))
-        log_pulses = np.interp(logit(min(rd, 1 - 1e-9)), odds, np.log(found.x[pair]))
+        odds = scipy.special.logit(np.clip(rising[pair], 1e-9, 1 - 1e-9))
+        log_pulses = np.interp(scipy.special.logit(min(rd, 1 - 1e-9)), odds, np.log(found.x[pair]))
         return math.exp(log_pulses)
 
     intervals = found.simulated[method]

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture, Detection
@@ -135,7 +135,9 @@ def surrogate_of(capture: Capture, name: str) -> Simulation:
             f"confidence = {image.confidence.max():.2f} at most is not accepted: give a capture in "
             f"which some pixels are ranged with {MIN_CONFIDENCE:g} or more."
         )
-    nearest = distance_transform_edt(~clear, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~clear, return_distances=False, return_indices=True
+    )
     delay_bin = image.bin[tuple(nearest)]
     signal = np.zeros(capture.shape)
     signal[target] = _assigned(
