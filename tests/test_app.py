@@ -242,9 +242,9 @@ def test_a_cloud_states_what_its_box_hides_and_shows_grey(car):
 def test_a_misfit_is_stated_once_it_is_known():
     worn, kind = compute(ask("worn"), None), "Estimate"
     drawn = looks.image_of(worn, kind, Viewing())
-    assert "relied" not in looks.legend(worn, kind, Viewing(), *drawn)
+    assert "unreliable" not in looks.legend(worn, kind, Viewing(), *drawn)
     misfit = fit_of(worn.capture).remark
-    assert "relied" in misfit
+    assert "unreliable" in misfit
     assert f"{misfit.capitalize()}." in looks.legend(worn, kind, Viewing(), *drawn)
 
 

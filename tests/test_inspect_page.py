@@ -288,6 +288,7 @@ def test_hot_and_dead_pixels_are_listed_marked_and_shown_by_a_press():
 def test_the_image_posterior_shows_what_neighbours_tell():
     session = Session({"car": built_in_sources()["car"]}, tasks=HeldTasks())
     session.state.param.update(method="image_posterior", pixel=(32, 32))
+    session.tasks.run_until(lambda: session.answer.method == "image_posterior")
     section = on_screen(PixelSection(session, "pixel"))
     found = section.found.report
     assert found.evidence is not None

@@ -257,7 +257,8 @@ def test_sigterm_stops_at_any_time_and_cancels_long_work():
         line = next(line for line in server.stdout if line.startswith("Open"))
         Site(line.split()[1]).ask()
         rest = server.communicate(timeout=60)[0]
-    assert {"begun", "now", "ended"} <= set(rest.split())
+    for word in ("begun", "now", "ended"):  # written by two threads, so that lines may run together
+        assert word in rest
     assert server.returncode == 0
 
 
