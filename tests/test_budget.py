@@ -98,7 +98,9 @@ def test_groups_of_pulses_count_for_the_limits(monkeypatch):
     monkeypatch.setattr(budget, "REQUEST_S", 0.5)
     moving = Request(built_in_sources()["approach"], method="velocity")
     assert compute(replace(moving, method="likelihood"), None).request.less == ReductionSettings()
-    assert compute(moving, None).request.less != ReductionSettings()
+    for judge in ("pixel", "image"):
+        request = replace(moving, judged_by=judge)
+        assert compute(request, None).request.less != ReductionSettings()
 
 
 def test_computations_of_other_pages_are_limited(source, monkeypatch):

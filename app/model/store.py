@@ -390,7 +390,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         capture, capture_s = previous.capture, previous.capture_s
     else:
         shape = _reduced_shape(whole, request)
-        require_fitting(shape, _costliest(whole, request), _cost(whole, request, shape))
+        require_fitting(shape, *_costliest(whole, request, shape))
         capture = reduced(whole, request)
         if request.less != requested:
             source = f"{capture.source}; reduced to fit the limits of this server"
@@ -473,20 +473,24 @@ def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:
     return reduction.shape(shape) if reduction.fits(shape) else shape
 
 
-def _costliest(whole: Capture, request: Request) -> str:
-    """Return the method of a request that takes most memory and time."""
-    return "image_posterior" if request.judged_by == "image" else request.method_for(whole)
-
-
-def _cost(whole: Capture, request: Request, shape: tuple[int, int, int]) -> Cost:
-    """Predict the cost of a request for a capture that is reduced to a shape."""
-    method = _costliest(whole, request)
-    return predicted(shape, method, request.settings_of(method), n_groups=n_groups_of(whole))
+def _costliest(whole: Capture, request: Request, shape: tuple[int, int, int]) -> tuple[str, Cost]:
+    """Return the slowest method of a request, and its cost for a capture reduced to a shape."""
+    methods = {request.method_for(whole)}
+    if request.judged_by == "image":
+        methods.add("image_posterior")
+    groups = n_groups_of(whole)
+    costs = {
+        each: predicted(shape, each, request.settings_of(each), n_groups=groups) for each in methods
+    }
+    return max(costs.items(), key=lambda each: each[1].seconds)
 
 
 def _fitting(whole: Capture, request: Request) -> ReductionSettings:
     """Return the requested reduction, or the weakest stronger one that fits."""
-    cost = partial(_cost, whole, request)
+
+    def cost(shape: tuple[int, int, int]) -> Cost:
+        return _costliest(whole, request, shape)[1]
+
     if fits(cost(_reduced_shape(whole, request))):
         return request.less
     rows, cols, n_bins = whole.cube.shape
