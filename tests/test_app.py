@@ -641,7 +641,7 @@ def test_a_page_is_complete(own_layout):
     assert f"Hidden: {4096 - shown:,} below confidence 0.9." in explore.cloud.caption
     model = layout.page.get_root()
     kinds = [type(part).__name__ for part in model.references()]
-    assert kinds.count("figure") == 5  # one of them is hidden
+    assert kinds.count("figure") == 4  # one more is sent when it is first shown
     assert sum(kind.startswith("PointCloud") for kind in kinds) == 1
 
 

@@ -82,6 +82,12 @@ def on_screen(section, until=lambda section: section.found):
     return section
 
 
+def shown_below(section):
+    """The plot below the counts."""
+    (name,) = (name for name, card in section.cards.items() if card.visible and name != "counts")
+    return name
+
+
 def values(facts):
     return {name: value for name, value, _ in facts.facts}
 
@@ -307,12 +313,13 @@ def test_the_image_posterior_shows_what_neighbours_tell():
     session.state.plot = NEIGHBOURS
     assert section.explanation.visible
     assert "Here the score is shown" in section.explanation.text
-    assert section.plots.below(section.found, NEIGHBOURS) is section.plots.score
+    assert shown_below(section) == "score"
     session.state.judged_by = "image"
     session.tasks.run_until(lambda: section.found.report.evidence is not None)
     assert not section.explanation.visible
-    assert section.plots.below(section.found, NEIGHBOURS) is section.plots.evidence
-    assert section.plots.below(section.found, "Score") is section.plots.score
+    assert shown_below(section) == "evidence"
+    session.state.plot = "Score"
+    assert shown_below(section) == "score"
 
 
 def test_everything_about_a_pixel_is_cores(near):
@@ -321,6 +328,8 @@ def test_everything_about_a_pixel_is_cores(near):
     near.tasks.run_until(lambda: values(section.facts).get("Pixel") == "40, 30")
     capture, tracking = near.answer.capture, near.answer.request.tracking
     signals = tracking_signals(capture.cube[40, 30], tracking, capture.gated_pulses)
+    near.state.plot = "Rate"
+    near.state.plot = "Score"
     counts, rate, stages = section.plots.counts, section.plots.rate, section.plots.stages
     for plot, name, expected in (
         (counts, "raw", capture.cube[40, 30]),
@@ -365,6 +374,7 @@ def test_a_file_without_truth_has_no_error(far):
     section = on_screen(PixelSection(far, "pixel"))
     names = values(section.facts).keys()
     assert "Estimate" in names and not names & {"Truth", "Error"}
+    far.state.plot = "Rate"
     assert "as counted" in section.plots.rate.figure.title.text
     section.paint(True)
     assert section.plots.counts.figure.title.text_color == DARK.text
@@ -373,7 +383,7 @@ def test_a_file_without_truth_has_no_error(far):
 def test_a_region_shows_the_sum_of_its_histograms(near):
     section = on_screen(PixelSection(near, "region"), lambda each: each.remark.text)
     assert section.remark.text == text.NO_REGION
-    assert not any(each.visible for each in section.cards)
+    assert not any(each.visible for each in section.cards.values())
     near.state.region = rectangle((40, 44), (30, 33))
     near.tasks.run_until(lambda: section.found)
     summed = near.answer.capture.cube[40:45, 30:34].sum(axis=(0, 1))
@@ -387,11 +397,10 @@ def test_a_region_shows_the_sum_of_its_histograms(near):
     assert facts["Median range"] == f"{np.nanmedian(image):.{decimals}f} m"
     assert facts["SBR"] == text.interval(expected.region.flux.sbr)
     assert section.remark.text.startswith(expected.region.fit.verdict)
-    visible = [each.visible for each in section.cards]
+    assert shown_below(section) == "stages"
     near.state.plot = "Fit"
     near.tasks.run_until(lambda: section.plots.residuals.curve("deviation").size)
-    shown = [each.visible for each in section.cards]
-    assert shown[0] and sum(shown) == sum(visible) == 2 and shown != visible
+    assert shown_below(section) == "residuals"
     predicted = predict(expected).counts
     drawn = section.plots.counts.source("fit").data
     for name, curve in (("fit", predicted.expected), ("low", predicted.low)):
@@ -675,12 +684,11 @@ def test_region_pins_and_capture_are_saved_as_shown(name, request):
 
     section = on_screen(PixelSection(session, "region"))
     assert section.view.main
+    session.state.plot = "Rate"
     is_tracking = session.answer.method == "tracking"
-    hidden, shown = ("score", "residual and enhanced")[:: 1 if is_tracking else -1]
-    visible = section.downloads.keys() - {hidden, "pixel and neighbours", "residuals of the fit"}
-    assert visible >= {"rate", shown}
-    saved = {button: section.downloads[button]() for button in visible}
-    assert saved.keys() >= {"counts", "numbers", "table"}
+    below = {"residual and enhanced" if is_tracking else "score", "rate"}
+    assert section.downloads.keys() == below | {"counts", "numbers", "table"}
+    saved = {button: save() for button, save in section.downloads.items()}
     assert {each.subject.part for each in saved.values()} == {"rows40-44_cols30-33"}
     summed = cube[40:45, 30:34].sum(axis=(0, 1))
     np.testing.assert_array_equal(table_of(section, "counts")["counts"][:n_bins], summed)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 from app.theme import Palette, line_style
 from core import ESTIMATORS, Capture
 from core.inference import flux_model_of
+from core.parameters import spec_of
 
 _MOST_SBR = 0.2  # of the sweeps, but for that of the peak
 
@@ -23,6 +25,14 @@ METHOD_PLACES = {
 """Place of each method in the sequence of line styles, the same in all plots."""
 
 METHOD_TITLES = {name: estimator.title for name, estimator in ESTIMATORS.items()}
+
+
+PARAMETER_SYMBOLS = {
+    (name, each.name): spec_of(each).symbol
+    for name, estimator in ESTIMATORS.items()
+    for each in fields(estimator.parameters)
+}
+"""Symbol of each setting, by method and field."""
 
 
 def method_title(name: str) -> str:

@@ -417,7 +417,7 @@ class Layout:
         self._link.follow(state, session.query, session.is_settled, later, at_once)
         self._link.param.watch(lambda event: session.recall(event.new[0]), "visited")
         session.estimate.changed.subscribe(self._show_answer)
-        session.estimate.busy.subscribe(partial(setattr, self._busy, "visible"))
+        tasks.busy.changed.subscribe(partial(setattr, self._busy, "visible"))
         session.failures.shown.subscribe(self._show_failure)
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")

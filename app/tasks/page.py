@@ -9,6 +9,7 @@ from typing import Any
 import panel as pn
 from tornado.ioloop import IOLoop
 
+from app.tasks.busy import Busy
 from app.tasks.scheduler import GENERAL, Act, Lane, Latest, LongWork
 from app.tasks.signals import Signal
 from app.tasks.turns import TURNS
@@ -28,11 +29,14 @@ class PageTasks:
         The page's document.
     failed : Signal of Exception
         Emitted when a callback raises.
+    busy : Busy
+        Whether a request takes long; long work has progress of its own.
     """
 
     def __init__(self) -> None:
         self.document = pn.state.curdoc
         self.failed: Signal[Exception] = Signal()
+        self.busy = Busy(self)
         self._was_served = self.is_served
         self._loop = IOLoop.current() if self._was_served else None
 
@@ -114,7 +118,7 @@ class PageTasks:
 
     def latest(self, lane: Lane = GENERAL) -> Latest:
         """Return a channel for work of which only the newest request counts."""
-        return Latest(self, lane)
+        return Latest(self, lane, self.busy)
 
     def long_work(self, changed: Act, failed: Callable[[Exception], None]) -> LongWork:
         """Return long work of the page; see `app.tasks.scheduler.LongWork`."""

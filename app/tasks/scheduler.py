@@ -15,6 +15,8 @@ from functools import partial
 from threading import Lock
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
+from app.tasks.busy import Busy
+
 Result = TypeVar("Result")
 Act = Callable[[], None]
 Failed = Callable[[Exception], None]
@@ -137,11 +139,14 @@ class Latest:
         Draws the results.
     lane : Lane
         Default lane of the requests.
+    busy : Busy, optional
+        Hears of each request.
     """
 
-    def __init__(self, page: PageThread, lane: Lane = GENERAL) -> None:
+    def __init__(self, page: PageThread, lane: Lane = GENERAL, busy: Busy | None = None) -> None:
         self._page = page
         self._lane = lane
+        self._busy = busy
         self._lock = Lock()
         self._newest: _Request | None = None
         self._is_busy = False
@@ -163,12 +168,17 @@ class Latest:
             if self._is_busy:
                 return
             self._is_busy = True
-        self._start()
+        self._begin()
 
     @property
     def has_more(self) -> bool:
         """Whether another request waits behind the present one."""
         return self._newest is not None
+
+    def _begin(self) -> None:
+        if self._busy is not None:
+            self._busy.begin(self)
+        self._start()
 
     def _start(self) -> None:
         assert self._newest is not None
@@ -210,10 +220,12 @@ class Latest:
         except Exception as error:  # a result that cannot be drawn counts as a failure
             failed(error)
         finally:
+            if self._busy is not None:
+                self._busy.end(self)
             with self._lock:
                 self._is_busy = self._newest is not None
             if self._is_busy:
-                self._start()
+                self._begin()
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import panel as pn
 import panel_material_ui as pmui
@@ -122,6 +122,27 @@ class Part(pmui.Card):
     _headers = param.List(default=[], item_type=object)
 
 
+Holder = TypeVar("Holder", bound=pn.layout.ListLike)
+
+
+def sent_when_visible(holder: Holder) -> Holder:
+    """Take the content out of a hidden column or a folded part until it is first visible.
+
+    The browser draws what is hidden, too, which takes most of the time in which a page opens.
+    """
+    content = list(holder.objects)
+
+    def fill(*_: Any) -> None:
+        is_visible = holder.visible and not getattr(holder, "collapsed", False)
+        if is_visible and not holder.objects:
+            holder.extend(content)
+
+    holder.clear()
+    holder.param.watch(fill, ["collapsed", "visible"] if "collapsed" in holder.param else "visible")
+    fill()
+    return holder
+
+
 def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True) -> Part:
     """Return a part of the sidebar that folds; its content is sent when it is first visible."""
     made = Part(
@@ -135,13 +156,8 @@ def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True)
         margin=(4, 6),
     )
 
-    def fill(*_: Any) -> None:
-        if made.visible and not made.collapsed and not made.objects:
-            made.extend(content)
-
-    made.param.watch(fill, ["collapsed", "visible"])
-    fill()
-    return made
+    made.extend(content)
+    return sent_when_visible(made)
 
 
 def card(*content: Any) -> pn.Column:

@@ -38,16 +38,16 @@ class LikelihoodParameters(Settings):
     )
     depths: Depths = parameter(
         "alike",
-        Choice("Depths", ("alike", "learned")),
-        "Prior of the depth: uniform over the gate, or estimated from the other pixels of the "
+        Choice("Depth prior", ("alike", "learned")),
+        "Prior of the depth: all depths of the gate alike, or learned from the other pixels of the "
         "image.",
     )
     rule: Rule = parameter(
         "density",
-        Choice("Answer", ("density", "window", "mean", "median")),
-        "Answer: the likeliest delay (density), or the best for one figure: for the restoration "
-        "degree the delay with most probability within 3 bins (window), for the RMSE the mean, for "
-        "the mean error the median of the posterior.",
+        Choice("Delay taken", ("density", "window", "mean", "median")),
+        "Delay that is taken from the posterior: the likeliest (density), or the best for one "
+        "figure: for the restoration degree that with most probability within 3 bins (window), for "
+        "the RMSE the mean, for the mean absolute error the median.",
     )
 
 

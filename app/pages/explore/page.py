@@ -41,7 +41,7 @@ from app.plots.gate_axes import GateAxes
 from app.plots.gate_cut import Cut
 from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
-from app.widgets.cards import BREAK_PX, board, card, choice, column, part, steady
+from app.widgets.cards import BREAK_PX, board, card, choice, column, part, sent_when_visible, steady
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import (
     FACTS_PX,
@@ -144,6 +144,9 @@ class Explore(Section):
         histogram.css_classes = [HISTOGRAM]
         for each in answers:  # only one is visible
             each.css_classes = [ESTIMATE]
+        for each in self.cards[1:]:
+            each.visible = False
+            sent_when_visible(each)
         self.zoom = EchoZoom(self.signals.histogram.figure.x_range)
         self.cards[0].append(self.zoom.button)
         state = session.state

@@ -23,7 +23,7 @@ from app.pages.inspect.results import (
     inspect_region,
     predict,
 )
-from app.pages.inspect.views import PixelPlots
+from app.pages.inspect.views import GatePlot, PixelPlots
 from app.pages.session import Session
 from app.pages.shared.downloads import Shown, pixel_on_show, region_on_show
 from app.pages.shared.echo_zoom import EchoZoom
@@ -55,11 +55,15 @@ FACTS_ACROSS, FACT_ROWS = 4, 3
 TABLE_PX = 217
 """Height of the table with the largest number of candidates, reserved from the start."""
 
-BUTTONS = (
-    *("counts", "rate", "residual and enhanced", "score", "pixel and neighbours"),
-    "residuals of the fit",
-)
-"""Names of the plots of `PixelPlots` on their download buttons."""
+BUTTONS = {
+    "counts": "counts",
+    "rate": "rate",
+    "stages": "residual and enhanced",
+    "score": "score",
+    "evidence": "pixel and neighbours",
+    "residuals": "residuals of the fit",
+}
+"""Names of the plots of `PixelPlots` on their download buttons, by attribute."""
 
 IMMEDIATE_BINS = 1000
 """Gate up to which a pixel is inspected where the event arrives: 6 ms at 200 bins, 13 ms at 1000;
@@ -102,8 +106,8 @@ class PixelSection(Section):
         What is shown; None while there is nothing to show.
     plots : PixelPlots
     zoom : EchoZoom
-    cards : list of pn.Column
-        The plots in their frames.
+    cards : dict of str to pn.Column
+        The plots that have been shown, in their frames, by the attribute of `plots`.
     facts : Facts
     remark, explanation : Sentence
         What is to be said of the pixel or region, and of its fit while that is shown.
@@ -122,12 +126,8 @@ class PixelSection(Section):
         self.plots = PixelPlots()
         self.plots.cut.dragged.subscribe(session.cut_gate)
         self._painted = [self.plots]
-        self.cards = [
-            self.offer_plot(framed(pane_of(plot.figure)), what, plot, what)
-            for plot, what in zip(self.plots.plots, BUTTONS, strict=True)
-        ]
+        self.cards: dict[str, pn.Column] = {}
         self.zoom = EchoZoom(self.plots.bins)
-        self.cards[0].append(self.zoom.button)
         height = FACT_ROWS * FACTS_PX
         self.facts = Facts(
             leading=True, stylesheets=[FACTS], min_height=height, sizing_mode="stretch_width"
@@ -141,12 +141,22 @@ class PixelSection(Section):
             sizing_mode="stretch_width",
             margin=0,
         )
+        self._stage = stage()
+        self._add_card("counts").append(self.zoom.button)
 
     def layout(self) -> tuple[Any, Any]:
         """Return facts and plots, and the table that stands below the map."""
         facts = self.offer_facts(self.facts, lambda: "numbers")
-        main = stage(facts, self.remark, self.explanation, *self.cards)
-        return main, self.offer_table(self.table, "candidates")
+        self._stage[:] = [facts, self.remark, self.explanation, *self.cards.values()]
+        return self._stage, self.offer_table(self.table, "candidates")
+
+    def _add_card(self, name: str) -> pn.Column:
+        plot: GatePlot = getattr(self.plots, name)
+        what = BUTTONS[name]
+        made = self.offer_plot(framed(pane_of(plot.figure)), what, plot, what)
+        self.cards[name] = made
+        self._stage.append(made)
+        return made
 
     def saved(self, what: str, csv: Write) -> Shown:
         """Return a plot or a table as it is saved, named after the pixel or the region."""
@@ -191,18 +201,19 @@ class PixelSection(Section):
             self.facts.param.update(facts=[], min_height=0)
             self.remark.text, self.table.rows = why, []
             self.explanation.visible = False
-            for each in self.cards:
+            for each in self.cards.values():
                 each.visible = False
 
     def _draw(self, found: Inspected) -> None:
         state = self.session.state
         with_fit = state.plot == "Fit"
         self.plots.cut.update(Cut.of(found.answer, state.less))
-        self.plots.update(found, state.unit, with_fit)
+        below = self.plots.update(found, state.unit, state.plot)
         self.zoom.follow(found.answer.capture, found.pixel.answer_bin)
-        shown = self.plots.counts, self.plots.below(found, state.plot)
-        for each, plot in zip(self.cards, self.plots.plots, strict=True):
-            each.visible = plot in shown
+        if below not in self.cards:
+            self._add_card(below)
+        for name, each in self.cards.items():
+            each.visible = name in ("counts", below)
         self._drawn, self._is_outdated = found, False
         is_without = state.plot == NEIGHBOURS and found.report.evidence is None
         self.explanation.visible = with_fit or is_without

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -30,8 +30,8 @@ from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.plots.gate_cut import GateCut
-from app.theme import Palette
-from app.units import ShownGate, scale
+from app.theme import LIGHT, Palette
+from app.units import Scale, ShownGate, scale
 from app.widgets.figures import Layers, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
 from core import ESTIMATORS
@@ -336,24 +336,16 @@ class GatePlot(NamedLayers):
 
 
 class PixelPlots:
-    """Counts, rate, and stages or score of a pixel or a region, linked along the gate.
+    """Counts, and one plot below them, of a pixel or a region, linked along the gate.
+
+    A plot is made when it is first shown: making, sending and drawing one takes longer than all
+    else that a page needs to show a pixel.
 
     Attributes
     ----------
     bins : Range1d
         The common axis along the gate.
-    counts, rate : GatePlot
-    stages : GatePlot
-        Residual and enhanced signal of the tracking differentiator.
-    score : GatePlot
-        Score of another method, in its place.
-    evidence : GatePlot
-        The evidence of the neighbours and of the pixel; in place of the score of a method that
-        uses neighbours.
-    residuals : GatePlot
-        Residuals of the counts from those that the model expects.
-    plots : tuple of GatePlot
-        All, from top to bottom.
+    counts : GatePlot
     candidates : ColumnDataSource
         Marks of the candidates.
     cut : GateCut
@@ -363,80 +355,94 @@ class PixelPlots:
     def __init__(self) -> None:
         nowhere, upright = plots.marker_line(np.nan, 1.0)
         self.candidates = inspect_plots.empty("x", "y", "rank", "lift")
-        marks = {
+        self._marks = {
             "truth": ColumnDataSource({"x": nowhere, "y": upright}),
             "estimate": ColumnDataSource({"x": nowhere, "y": upright}),
             "candidates": self.candidates,
         }
         self.bins = Range1d(0, 1)
-        counts = {"Counts": "raw", "Small scale": "small", "Large scale": "large"}
-        stages = {"Residual": "residual", "Enhanced": "enhanced"}
-        self.counts = GatePlot(inspect_plots.counts(self.bins, marks), counts, has_top=True)
-        self.rate = GatePlot(inspect_plots.rate(self.bins, marks), {"Rate": "rate"})
-        self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
-        self.score = GatePlot(inspect_plots.score(self.bins, marks), {"Score": "score"})
-        parts = {"Pixel alone": "alone", "Neighbours": "neighbours", "Both": "posterior"}
-        self.evidence = GatePlot(inspect_plots.evidence(self.bins, marks), parts)
-        deviation = {"Residual": "deviation", "Expected": "fit", "95 % from": "low", "to": "high"}
-        self.residuals = GatePlot(inspect_plots.residuals(self.bins, marks), deviation)
-        scores = self.stages, self.score, self.evidence
-        self.plots = self.counts, self.rate, *scores, self.residuals
+        self._colors = LIGHT
+        self._made: list[GatePlot] = []
+        read_out = {"Counts": "raw", "Small scale": "small", "Large scale": "large"}
+        self.counts = self._make(inspect_plots.counts, read_out, has_top=True)
         self.cut = GateCut(self.counts.figure, self.bins)
+
+    @cached_property
+    def rate(self) -> GatePlot:
+        """The rate with pile-up corrected."""
+        return self._make(inspect_plots.rate, {"Rate": "rate"})
+
+    @cached_property
+    def stages(self) -> GatePlot:
+        """Residual and enhanced signal of the tracking differentiator."""
+        return self._make(inspect_plots.stages, {"Residual": "residual", "Enhanced": "enhanced"})
+
+    @cached_property
+    def score(self) -> GatePlot:
+        """The score of another method, in place of the stages."""
+        return self._make(inspect_plots.score, {"Score": "score"})
+
+    @cached_property
+    def evidence(self) -> GatePlot:
+        """The evidence of the neighbours and of the pixel.
+
+        In place of the score of a method that uses neighbours.
+        """
+        read_out = {"Pixel alone": "alone", "Neighbours": "neighbours", "Both": "posterior"}
+        return self._make(inspect_plots.evidence, read_out)
+
+    @cached_property
+    def residuals(self) -> GatePlot:
+        """Residuals of the counts from those that the model expects."""
+        read_out = {"Residual": "deviation", "Expected": "fit", "95 % from": "low", "to": "high"}
+        return self._make(inspect_plots.residuals, read_out)
+
+    def _make(
+        self, figure: Callable[..., Any], read_out: Mapping[str, str], has_top: bool = False
+    ) -> GatePlot:
+        made = GatePlot(figure(self.bins, self._marks), read_out, has_top)
+        made.paint(self._colors)
+        self._made.append(made)
+        return made
 
     def paint(self, colors: Palette) -> None:
         """Take on the colours of a mode."""
-        for plot in self.plots:
+        self._colors = colors
+        for plot in self._made:
             plot.paint(colors)
         self.counts.layers["ranks"]["glyph"].background_fill_color = colors.paper
         self.cut.paint(colors)
 
-    def below(self, found: Inspected, name: str) -> GatePlot:
-        """Return the plot of one of `app.model.state.PLOTS`."""
-        if name in ("Rate", "Fit"):
-            return self.rate if name == "Rate" else self.residuals
-        is_score = ESTIMATORS[found.report.method].evidence is not None
-        if found.report.evidence is not None and (is_score or name == NEIGHBOURS):
-            return self.evidence
-        return self.score if found.pixel.signals is None else self.stages
-
-    def update(self, found: Inspected, unit: str, with_fit: bool) -> None:
+    def update(self, found: Inspected, unit: str, plot: str) -> str:
         """Show a pixel or a region, with positions in a unit.
 
-        `with_fit` leaves room for the counts that the model expects, which `draw_fit` draws.
+        Parameters
+        ----------
+        found : Inspected
+        unit : str
+        plot : str
+            What to show below the counts, of `app.model.state.PLOTS`. That of a fit stays empty
+            until `draw_fit` draws the counts that the model expects.
+
+        Returns
+        -------
+        below : str
+            The attribute that holds the plot below the counts.
         """
-        pixel, report = found.pixel, found.report
-        gate = found.answer.gate
-        for plot in self.plots:
-            plot.follow(unit, gate)
-        curves = partial(plots.bin_curves, inspect_plots.NAMES)
-        positions = {"truth": pixel.truth_bin, "estimate": pixel.answer_bin}
-        candidates = [each.bin for each in report.candidates]
+        pixel, report, gate = found.pixel, found.report, found.answer.gate
+        name = _below(found, plot)
+        below: GatePlot = getattr(self, name)
+        for each in (self.counts, below):
+            each.follow(unit, gate)
         marks = _marks(found)
-        self._draw_counts(pixel, gate, marks, with_fit)
-        self.rate.draw(gate, curves(report.rate_unit, rate=report.rate) + marks)
-        self.rate.frame(report.rate)
-        self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
-        self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
-        along = scale(unit, gate)
-        if report.evidence is not None:
-            self.evidence.draw(gate, curves("probability", **report.evidence._asdict()) + marks)
-            self.evidence.frame(*report.evidence)
-        if pixel.signals is None:
-            self.score.figure.title.text = plots.score_title(plots.SCORE_TITLE, pixel, along)
-            self.score.draw(gate, curves("", score=pixel.score) + marks)
-            fit(self.score.figure, *plots.score_ends(pixel.score))
-        else:
-            title = plots.score_title(inspect_plots.STAGES_TITLE, pixel, along)
-            self.stages.figure.title.text = title
-            residual = curves("counts", residual=pixel.signals.residual)
-            enhanced = curves("counts × weight", enhanced=pixel.signals.enhanced)
-            self.stages.draw(gate, residual + enhanced + marks)
-            self.stages.frame(pixel.signals.residual)
-            self.stages.frame(pixel.signals.enhanced, axis="enhanced")
-        for name, position in positions.items():
-            self.counts.write(name, x=np.full(2, position))
-            for plot in self.plots:
-                plot.show(name, bool(np.isfinite(position)))
+        self._draw_counts(pixel, gate, marks, with_fit=name == "residuals")
+        draw: Callable[..., None] = getattr(self, f"_draw_{name}")
+        draw(found, marks, scale(unit, gate))
+        for mark, position in (("truth", pixel.truth_bin), ("estimate", pixel.answer_bin)):
+            self.counts.write(mark, x=np.full(2, position))
+            for each in (self.counts, below):
+                each.show(mark, bool(np.isfinite(position)))
+        candidates = [each.bin for each in report.candidates]
         extent = self.bins.reset_end - self.bins.reset_start
         self.candidates.data = {
             "x": np.array(candidates, np.float32),
@@ -444,16 +450,50 @@ class PixelPlots:
             "rank": [str(n + 1) for n in range(len(candidates))],
             "lift": inspect_plots.lifts(candidates, inspect_plots.RANK_GAP * extent),
         }
+        return name
+
+    def _draw_rate(self, found: Inspected, marks: list[Curve], along: Scale) -> None:
+        rate, unit = found.report.rate, found.report.rate_unit
+        self.rate.draw(found.answer.gate, _curves(unit, rate=rate) + marks)
+        self.rate.frame(rate)
+        self.rate.figure.yaxis[0].axis_label = unit.capitalize()
+        self.rate.figure.title.text = inspect_plots.RATE_TITLES[unit]
+
+    def _draw_evidence(self, found: Inspected, marks: list[Curve], along: Scale) -> None:
+        evidence = found.report.evidence
+        assert evidence is not None
+        self.evidence.draw(found.answer.gate, _curves("probability", **evidence._asdict()) + marks)
+        self.evidence.frame(*evidence)
+
+    def _draw_score(self, found: Inspected, marks: list[Curve], along: Scale) -> None:
+        score = found.pixel.score
+        self.score.figure.title.text = plots.score_title(plots.SCORE_TITLE, found.pixel, along)
+        self.score.draw(found.answer.gate, _curves("", score=score) + marks)
+        fit(self.score.figure, *plots.score_ends(score))
+
+    def _draw_stages(self, found: Inspected, marks: list[Curve], along: Scale) -> None:
+        signals = found.pixel.signals
+        assert signals is not None
+        title = plots.score_title(inspect_plots.STAGES_TITLE, found.pixel, along)
+        self.stages.figure.title.text = title
+        residual = _curves("counts", residual=signals.residual)
+        enhanced = _curves("counts × weight", enhanced=signals.enhanced)
+        self.stages.draw(found.answer.gate, residual + enhanced + marks)
+        self.stages.frame(signals.residual)
+        self.stages.frame(signals.enhanced, axis="enhanced")
+
+    def _draw_residuals(self, found: Inspected, marks: list[Curve], along: Scale) -> None:
+        self.residuals.keep(found.answer.gate, [])
+        _empty(self.residuals.source("deviation"))
 
     def draw_fit(self, found: Inspected, predicted: Predictive) -> None:
         """Draw the counts that the model expects, and the residuals."""
         gate, marks = found.answer.gate, _marks(found)
-        curves = partial(plots.bin_curves, inspect_plots.NAMES)
         bins, low, high = plots.centres(gate.n_bins), predicted.low, predicted.high
         ends = band("band", inspect_plots.NAMES["band"], bins, low, high, "counts")
-        fitted = curves("counts", raw=predicted.counts, fit=predicted.expected)
+        fitted = _curves("counts", raw=predicted.counts, fit=predicted.expected)
         self.counts.keep(gate, [*fitted, *ends, *marks])
-        self.residuals.keep(gate, [*curves("", deviation=predicted.residual), *marks])
+        self.residuals.keep(gate, [*_curves("", deviation=predicted.residual), *marks])
         self.counts.frame(predicted.counts, high)
         ends_at = max(round_up(1.1 * float(np.abs(predicted.residual).max())), 3.0)
         fit(self.residuals.figure, -ends_at, ends_at)
@@ -471,16 +511,30 @@ class PixelPlots:
         plot, lines = self.counts, plots.drawn(known, gate.n_bins)
         titles = inspect_plots.COUNTS_TITLES[pixel.signals is not None]
         plot.figure.title.text = inspect_plots.FIT_TITLE if with_fit else titles
-        curves = plots.bin_curves(inspect_plots.NAMES, "counts", raw=pixel.histogram, **lines)
-        plot.draw(gate, curves + marks)
+        plot.draw(gate, _curves("counts", raw=pixel.histogram, **lines) + marks)
         for layer, counts in known.items():
             plot.show(layer, counts is not None)
         plot.frame(pixel.histogram, *lines.values())
         for layer in ("fit", "band"):
             plot.show(layer, with_fit)
-        self.residuals.keep(gate, [])
-        for predicted in (plot.source("fit"), self.residuals.source("deviation")):
-            predicted.data = {name: np.empty(0, np.float32) for name in predicted.data}
+        _empty(plot.source("fit"))
+
+
+_curves = partial(plots.bin_curves, inspect_plots.NAMES)
+
+
+def _empty(source: ColumnDataSource) -> None:
+    source.data = {name: np.empty(0, np.float32) for name in source.data}
+
+
+def _below(found: Inspected, plot: str) -> str:
+    """Return the attribute of `PixelPlots` for one of `app.model.state.PLOTS`."""
+    if plot in ("Rate", "Fit"):
+        return "rate" if plot == "Rate" else "residuals"
+    is_score = ESTIMATORS[found.report.method].evidence is not None
+    if found.report.evidence is not None and (is_score or plot == NEIGHBOURS):
+        return "evidence"
+    return "score" if found.pixel.signals is None else "stages"
 
 
 def _marks(found: Inspected) -> list[Curve]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from time import perf_counter
 
 import param
 
@@ -28,9 +27,6 @@ from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane
 from app.tasks.signals import Signal
-
-BUSY_MS = 200
-"""Time after which a progress bar is shown."""
 
 FEW_COUNTS = 2**20
 """Size of a cube (pixels × bins) up to which an estimate takes less time than drawing it."""
@@ -61,8 +57,8 @@ class CurrentEstimate:
         Emitted with each new estimate, and with the old one again where a request failed.
     refused : Refused or None
         The file that was requested last, as long as it could not be read.
-    busy : Signal of bool
-        Emitted with True when a request takes long, and with False when it is done.
+    is_settled : bool
+        Whether the answer is that of the latest request.
     """
 
     def __init__(
@@ -76,12 +72,10 @@ class CurrentEstimate:
     ) -> None:
         self.answer, self.refused = first, refused
         self.changed: Signal[Answer] = Signal()
-        self.busy: Signal[bool] = Signal()
+        self.is_settled = True
         self._state, self._sources = state, sources
         self._tasks, self._failures = tasks, failures
         self._channel = tasks.latest()
-        self._is_busy = False
-        self._began_s: float | None = None
         self._take_reduction(first)
         state.param.watch(lambda *_: self.refresh(), list(COMPUTED_FROM))
 
@@ -90,16 +84,10 @@ class CurrentEstimate:
         """The request described by the state."""
         return request_of(self._state, self._sources)
 
-    @property
-    def is_settled(self) -> bool:
-        """Whether the answer is that of the latest request."""
-        return self._began_s is None
-
     def refresh(self) -> None:
         """Compute the state's request, or again when more of its file has been read."""
         request = self.request
-        if self._began_s is None:
-            self._begin()
+        self.is_settled = False
         self._channel.submit(
             partial(compute, request, self.answer),
             self._accept,
@@ -116,7 +104,7 @@ class CurrentEstimate:
             offer_kinds(self._state, answer)  # those of the method
         with self._tasks.hold():  # one message for all consequences
             self._failures.clear(no_estimates(answer))
-            self._end()
+            self.is_settled = not self._channel.has_more
             self.changed.emit(answer)
 
     def _take_reduction(self, answer: Answer) -> None:
@@ -137,32 +125,9 @@ class CurrentEstimate:
             if not (request.source.is_scene or same_subject(request, self.answer.request)):
                 self.refused = Refused.of(request, error, why)
                 why = refusal(self.refused)
-        self._end()
+        self.is_settled = not self._channel.has_more
         self.changed.emit(self.answer)
         self._failures.report(error, lambda _: why)
-
-    # Progress bar
-
-    def _begin(self) -> None:
-        self._began_s = perf_counter()
-        self._tasks.call_later(BUSY_MS, self._check_busy)
-
-    def _check_busy(self) -> None:
-        if self._began_s is not None and perf_counter() - self._began_s >= 0.9e-3 * BUSY_MS:
-            self._is_busy = True
-            self._tasks.run_next(partial(self.busy.emit, True))
-
-    def _end(self) -> None:
-        self._began_s = None
-        if self._channel.has_more:
-            self._begin()
-        elif self._is_busy:  # a following request keeps the bar, which would flicker
-            self._tasks.call_later(BUSY_MS, partial(self._tasks.run_next, self._end_busy))
-
-    def _end_busy(self) -> None:
-        if self._began_s is None and self._is_busy:
-            self._is_busy = False
-            self.busy.emit(False)
 
 
 def lane_of(request: Request, previous: Answer) -> Lane:

@@ -15,7 +15,7 @@ from app.model.store import Answer
 from app.pages.session import Session
 from app.pages.shared.studies import OnePiece
 from app.tasks.scheduler import Work
-from app.widgets.cards import button
+from app.widgets.cards import button, sent_when_visible
 from app.widgets.controls import Sentence
 from core import Window
 from core.checks import require
@@ -62,14 +62,16 @@ class LargeView:
         whole = "Show all: all rows and columns; reads those that are missing."
         buttons, *rest = self._work.controls
         buttons.append(button("Show all", whole, self._go_back, margin=(6, 4)))
-        self.layout = pn.Column(
-            self._sentence,
-            pn.Row(*self._bounds.values(), sizing_mode="stretch_width", margin=0),
-            buttons,
-            *rest,
-            visible=False,
-            sizing_mode="stretch_width",
-            margin=0,
+        self.layout = sent_when_visible(
+            pn.Column(
+                self._sentence,
+                pn.Row(*self._bounds.values(), sizing_mode="stretch_width", margin=0),
+                buttons,
+                *rest,
+                visible=False,
+                sizing_mode="stretch_width",
+                margin=0,
+            )
         )
         for ranges in (figure.x_range, figure.y_range):
             for end in ("start", "end"):

@@ -16,7 +16,7 @@ from bokeh.models import Range1d
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import Curve, band, image_file, table_file
 from app.model.large import Grid
-from app.model.methods import METHOD_TITLES
+from app.model.methods import METHOD_TITLES, PARAMETER_SYMBOLS
 from app.model.text import NOT_COMPUTED, number
 from app.pages.paper.text import (
     COLUMN_HELP,
@@ -413,6 +413,9 @@ def table_of(item: items.Table) -> tuple[list[Any], list[dict[str, Any]]]:
 def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]:
     """Return text, value to sort by, and the smaller second line."""
     value = row[place]
+    if names[place] == "parameter":
+        method = row[names.index("method")]
+        return [PARAMETER_SYMBOLS[method, value], value, ""]
     if isinstance(value, str):
         return [_name(value), value or None, ""]
     if names[place] in FORMATS:

@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 from app.model.reading import changed_options
 from app.model.store import Refused, Source
 from app.model.text import cause
-from app.widgets.cards import button, part, select, typed
+from app.widgets.cards import button, part, select, sent_when_visible, typed
 from app.widgets.controls import Sentence
 from core.io import ReadOptions, reading_options
 
@@ -71,12 +71,14 @@ class ReadingForm:
         self._choices = pn.FlexBox(margin=0)
         self._asked: Source | None = None
         self._details = Sentence(sizing_mode="stretch_width", margin=8)
-        self.question = pn.Column(
-            self._choices,
-            part("Details", self._details, is_open=False),
-            visible=False,
-            sizing_mode="stretch_width",
-            margin=0,
+        self.question = sent_when_visible(
+            pn.Column(
+                self._choices,
+                part("Details", self._details, is_open=False),
+                visible=False,
+                sizing_mode="stretch_width",
+                margin=0,
+            )
         )
         self.player = pmui.Player(
             label="Record",
@@ -94,12 +96,8 @@ class ReadingForm:
         self._all = button(
             "All records", ALL_RECORDS_HELP, partial(self._read_records, None), (0, 8)
         )
-        self.records = pn.Column(
-            self.player,
-            self._all,
-            visible=False,
-            sizing_mode="stretch_width",
-            margin=0,
+        self.records = sent_when_visible(
+            pn.Column(self.player, self._all, visible=False, sizing_mode="stretch_width", margin=0)
         )
 
     def show(
