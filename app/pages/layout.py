@@ -41,7 +41,7 @@ from app.tasks.signals import Signal
 from app.theme import DARK, LIGHT, STYLES
 from app.units import ShownGate, scale
 from app.widgets.address_bar import AddressBar
-from app.widgets.cards import button, choice, part, select
+from app.widgets.cards import arriving, button, choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import file_button
@@ -356,6 +356,7 @@ class Layout:
                 "Tracking differentiator",
                 self._preset,
                 tracking.folded(MORE_TRACKING, *rare, is_open=is_open),
+                is_shown=False,
             ),
             Shared.REDUCTION: part("Data reduction", self._panels["less"].layout, is_open=False),
         }
@@ -366,7 +367,7 @@ class Layout:
             self._connection,
             Glossary(margin=0),
             self._tour,
-            self._busy,
+            arriving(self._busy),
             self.alert,
             self._reading.question,
             sizing_mode="stretch_width",
@@ -398,13 +399,15 @@ class Layout:
             self._truth_offer.layout,
             self._shared[Shared.UNIT],
             *(aside for name, aside in asides.items() if not self._pages[name].sidebar_last),
-            self._light_part,
-            self._budget.part,
-            self._reading.part,
-            self._truth.part,
-            self._shared[Shared.METHOD],
-            self._shared[Shared.TRACKING],
-            self._shared[Shared.REDUCTION],
+            arriving(
+                self._light_part,
+                self._budget.part,
+                self._reading.part,
+                self._truth.part,
+                self._shared[Shared.METHOD],
+                self._shared[Shared.TRACKING],
+                self._shared[Shared.REDUCTION],
+            ),
             part("Share", share.layout),
             *(aside for name, aside in asides.items() if self._pages[name].sidebar_last),
         ]

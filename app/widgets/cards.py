@@ -160,6 +160,21 @@ def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True)
     return sent_when_visible(made)
 
 
+def arriving(*parts: Any) -> pn.Column:
+    """Return a column of parts, each of which is sent when it is first visible."""
+    made = pn.Column(sizing_mode="stretch_width", margin=0)
+
+    def send(*_: Any) -> None:
+        sent = [each for each in parts if each.visible or each in made.objects]
+        if len(sent) > len(made.objects):
+            made.objects = sent
+
+    for each in parts:
+        each.param.watch(send, "visible")
+    send()
+    return made
+
+
 def card(*content: Any) -> pn.Column:
     """Return a framed picture."""
     return pn.Column(*content, stylesheets=[CARD], sizing_mode="stretch_both", margin=0)
