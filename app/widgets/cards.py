@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import panel as pn
@@ -128,24 +128,30 @@ Holder = TypeVar("Holder", bound=pn.layout.ListLike)
 def sent_when_visible(holder: Holder) -> Holder:
     """Take the content out of a hidden column or a folded part until it is first visible.
 
-    The browser draws what is hidden, too, which takes most of the time in which a page opens.
+    The browser takes as long to draw what is hidden as what is shown.
     """
     content = list(holder.objects)
+    holder.clear()
+    filled_when_visible(holder, lambda: content)
+    return holder
+
+
+def filled_when_visible(holder: pn.layout.ListLike, make: Callable[[], Sequence[Any]]) -> None:
+    """Make the content of a column or a part that folds when it is first visible."""
 
     def fill(*_: Any) -> None:
         is_visible = holder.visible and not getattr(holder, "collapsed", False)
         if is_visible and not holder.objects:
-            holder.extend(content)
+            holder.extend(make())
 
-    holder.clear()
     holder.param.watch(fill, ["collapsed", "visible"] if "collapsed" in holder.param else "visible")
     fill()
-    return holder
 
 
 def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True) -> Part:
     """Return a part of the sidebar that folds; its content is sent when it is first visible."""
     made = Part(
+        *content,
         title=title,
         title_variant="subtitle2",
         collapsed=not is_open,
@@ -155,8 +161,6 @@ def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True)
         sizing_mode="stretch_width",
         margin=(4, 6),
     )
-
-    made.extend(content)
     return sent_when_visible(made)
 
 

@@ -13,7 +13,14 @@ import panel_material_ui as pmui
 from app.model.reading import changed_options
 from app.model.store import Refused, Source
 from app.model.text import cause
-from app.widgets.cards import button, part, select, sent_when_visible, typed
+from app.widgets.cards import (
+    button,
+    filled_when_visible,
+    part,
+    select,
+    sent_when_visible,
+    typed,
+)
 from app.widgets.controls import Sentence
 from core.io import ReadOptions, reading_options
 
@@ -52,22 +59,11 @@ class ReadingForm:
         self, read: Callable[[ReadOptions], None], complain: Callable[[str], None]
     ) -> None:
         self._read, self._complain = read, complain
-        self._fields = {name: _field(name) for name in reading_options()}
-        self._reading, self._shown = ReadOptions(), dict.fromkeys(self._fields, "")
-        for field in self._fields.values():
-            if isinstance(field, pmui.TextInput):
-                field.param.watch(lambda _: self._apply(), "enter_pressed")
-        again = pmui.Button(label="Read again", size="small", margin=(6, 8))
-        again.on_click(lambda _: self._apply())
+        self._reading, self._shown = ReadOptions(), dict.fromkeys(reading_options(), "")
         self._about = Sentence(sizing_mode="stretch_width", margin=(4, 8), visible=False)
-        self.part = part(
-            "Reading options",
-            self._about,
-            *self._fields.values(),
-            again,
-            is_open=False,
-            is_shown=False,
-        )
+        self._fields: dict[str, Any] = {}
+        self.part = part("Reading options", is_open=False, is_shown=False)
+        filled_when_visible(self.part, self._form)
         self._choices = pn.FlexBox(margin=0)
         self._asked: Source | None = None
         self._details = Sentence(sizing_mode="stretch_width", margin=8)
@@ -99,6 +95,15 @@ class ReadingForm:
         self.records = sent_when_visible(
             pn.Column(self.player, self._all, visible=False, sizing_mode="stretch_width", margin=0)
         )
+
+    def _form(self) -> list[Any]:
+        self._fields = {name: _field(name, shown) for name, shown in self._shown.items()}
+        for field in self._fields.values():
+            if isinstance(field, pmui.TextInput):
+                field.param.watch(lambda _: self._apply(), "enter_pressed")
+        again = pmui.Button(label="Read again", size="small", margin=(6, 8))
+        again.on_click(lambda _: self._apply())
+        return [self._about, *self._fields.values(), again]
 
     def show(
         self, reading: ReadOptions, used: Mapping[str, str], n_records: int | None = None
@@ -144,7 +149,7 @@ class ReadingForm:
         self._read(replace(self._reading, records=records))
 
     def _fill(self, reading: ReadOptions, used: Mapping[str, str]) -> None:
-        shown = {name: reading.as_text(name) or used.get(name, "") for name in self._fields}
+        shown = {name: reading.as_text(name) or used.get(name, "") for name in self._shown}
         if (reading, shown) == (self._reading, self._shown):
             return
         self._reading, self._shown = reading, shown
@@ -152,20 +157,22 @@ class ReadingForm:
             field.value = shown[name]
 
     def _apply(self, chosen: Mapping[str, str] | None = None) -> None:
-        texts = {name: typed(field) for name, field in self._fields.items()} | dict(chosen or {})
+        typed_in = {name: typed(field) for name, field in self._fields.items()}
+        texts = self._shown | typed_in | dict(chosen or {})
         try:
             self._read(changed_options(self._reading, self._shown, texts))
         except ValueError as error:
             self._complain(cause(error))
 
 
-def _field(name: str) -> Any:
+def _field(name: str, value: str) -> Any:
     option = reading_options()[name]
     if option.kind.choices:
         choices = {"as guessed": ""} | {each: each for each in option.kind.choices}
-        return select(option.label, choices, "", option.help)
+        return select(option.label, choices, value, option.help)
     return pmui.TextInput(
         label=option.label,
+        value=value,
         description=option.help,
         placeholder="guess",
         size="small",
