@@ -10,6 +10,7 @@ from contextvars import ContextVar
 
 import pytest
 
+from app.tasks.busy import Busy
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane, Latest, LongWork, Step
 from app.tasks.turns import ROUNDS_BETWEEN, Turns
@@ -88,6 +89,95 @@ def test_a_thread_that_cannot_start_is_reported_for_each_request(monkeypatch):
     for name in range(3):
         client.submit(name)
     assert [type(each) for each in client.failed] == [BrokenExecutor] * 3
+
+
+# -- the progress bar ------------------------------------------------------------------------------
+
+
+class Clock:
+    """A page whose delayed callbacks run when the test says so."""
+
+    def __init__(self):
+        self.later = []
+
+    def call_later(self, wait_ms, act):
+        self.later.append((time.perf_counter() + 1e-3 * wait_ms, act))
+
+    def run_next(self, act):
+        act()
+
+    def wait(self):
+        """Let all delays pass, those of callbacks included."""
+        while self.later:
+            due_s, act = self.later.pop(0)
+            time.sleep(max(due_s - time.perf_counter(), 0.0))
+            act()
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def busy(clock):
+    made = Busy(clock)
+    made.said = []
+    made.changed.subscribe(made.said.append)
+    return made
+
+
+def test_long_work_is_announced_once_and_until_the_last_of_it_has_ended(clock, busy):
+    for work in "ab":
+        busy.begin(work)
+    clock.wait()
+    assert busy.said == [True]
+    busy.end("a")
+    clock.wait()
+    assert busy.said == [True]
+    busy.end("b")
+    assert busy.said == [True]
+    clock.wait()
+    assert busy.said == [True, False]
+
+
+def test_short_work_is_not_announced_however_often_it_is_asked_for(clock, busy):
+    for _ in range(3):
+        busy.begin("a")
+        busy.end("a")
+    clock.wait()
+    assert busy.said == []
+
+
+def test_work_that_follows_soon_keeps_the_bar(clock, busy):
+    busy.begin("a")
+    clock.wait()
+    busy.end("a")
+    busy.begin("b")
+    clock.wait()
+    assert busy.said == [True]
+    busy.end("b")
+    clock.wait()
+    assert busy.said == [True, False]
+
+
+def test_each_request_of_a_channel_counts_by_itself():
+    page = HeldTasks()
+    heard = []
+
+    class Heard:
+        def begin(self, work):
+            heard.append(("begin", work))
+
+        def end(self, work):
+            heard.append(("end", work))
+
+    channel = Latest(page, GENERAL, Heard())
+    for _ in range(3):
+        channel.submit(int, lambda _: None, lambda _: None)
+    page.run_one()
+    page.run_one()
+    assert heard == [("begin", channel), ("end", channel)] * 2
 
 
 # -- lanes -----------------------------------------------------------------------------------------

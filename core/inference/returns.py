@@ -49,7 +49,6 @@ _LEAST_FALSE_RETURN = 1e-3  # that so many pixels resolve
 _LIKELY = 0.5  # probability of a surface from which a pixel has one
 _FEWEST = 16  # pixels that stand for those with a surface
 _LEAST_GAIN = 2.0  # smaller gains are not computed
-_FEW = 64  # pixels, fitted in much less time than those that are drawn
 _BIN_COST = 100  # counts that other kernels process in the time of one
 _PIXELS_AT_ONCE = 256
 _SHAPE_PIXELS = 512  # from which the shape of the background is estimated
@@ -197,27 +196,13 @@ def returns_of(
     """
     allowed = isinstance(most, Integral) and 1 <= most <= MOST_RETURNS
     require("returns", most, allowed, f"an integer from 1 to {MOST_RETURNS}")
-    _check_share(false_return)
     pixels = np.flatnonzero(np.isfinite(bins))
     cube = capture.cube.reshape(-1, capture.cube.shape[2])[pixels]
-    several = most > 1 and _may_see_several(capture, cube)
-    least = least_gain(capture, false_return) if several else np.inf
+    least = least_gain(capture, false_return) if most > 1 else np.inf
     found = fitted_echoes(capture, cube, most, least)
     there = np.arange(most) < found.number[:, np.newaxis]
     likely = _confidence(capture, cube, found.delay, found.number)
     return as_returns(capture, bins, confidence, Surfaces(found.delay, found.signal, likely, there))
-
-
-def _may_see_several(capture: Capture, cube: NDArray[np.unsignedinteger]) -> bool:
-    """Whether a second echo could be accepted in any pixel; of many pixels, it always could."""
-    if len(cube) > _FEW:
-        return True
-    return bool((fitted_echoes(capture, cube, 2, _LEAST_GAIN).number > 1).any())
-
-
-def _check_share(false_return: float) -> None:
-    accepted = _LEAST_FALSE_RETURN <= false_return <= 1
-    require("false_return", false_return, accepted, f"{_LEAST_FALSE_RETURN} to 1")
 
 
 class Surfaces(NamedTuple):
@@ -277,7 +262,8 @@ def least_gain(capture: Capture, false_alarm: float = FALSE_RETURN) -> float:
     ValueError
         If `false_alarm` is out of its bounds.
     """
-    _check_share(false_alarm)
+    accepted = _LEAST_FALSE_RETURN <= false_alarm <= 1
+    require("false_return", false_alarm, accepted, f"{_LEAST_FALSE_RETURN} to 1")
     gains = _gains_of_one_surface(capture)
     kept = min(int(false_alarm * (gains.size + 1)), gains.size)
     return max(float(np.partition(gains, -kept)[-kept]), _LEAST_GAIN) if kept else float("inf")
