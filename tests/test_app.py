@@ -645,6 +645,19 @@ def test_a_page_is_complete(own_layout):
     assert sum(kind.startswith("PointCloud") for kind in kinds) == 1
 
 
+def test_a_page_draws_its_pixel_once_when_it_opens(monkeypatch):
+    drawn = []
+
+    def counted(*arguments):
+        drawn.append(arguments)
+        return inspect(*arguments)
+
+    monkeypatch.setattr("app.pages.explore.page.inspect", counted)
+    layout = HeldLayout(built_in_sources())
+    layout.settle()
+    assert len(drawn) == 1
+
+
 def draw_in_every_way(layout, explore):
     session = layout.session
     for kind in session.state.param.image.objects:

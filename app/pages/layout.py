@@ -262,7 +262,7 @@ class Layout:
         )
         self.pages.choice.param.update(sx=PAGE_BUTTONS, margin=(0, 0, 0, 8))
         self.page = self._template()
-        self._show_answer(session.answer)
+        self._fit_controls(session.answer)
         self._listen()
         if arrivals is not None:
             session.failures.remark(text.not_opened(arrivals.refused))
@@ -337,7 +337,7 @@ class Layout:
         self._tour = Tour(is_offered=state.page == EXPLORE, margin=0)
 
     def _make_parts(self, unit: Any) -> None:
-        """Make the parts of the sidebar that pages share; `_show_answer` shows one of the first."""
+        """Make the parts of the sidebar that pages share; `_fit_controls` shows them."""
         self._light_part = part("Simulation", self._panels["light"].layout, is_shown=False)
         if self.session.answer.request.reading != ReadOptions():
             self._reading.part.collapsed = False
@@ -485,6 +485,11 @@ class Layout:
         self.alert.text = sentence[:2000]
 
     def _show_answer(self, answer: Answer) -> None:
+        self._fit_controls(answer)
+        self.pages.follow(answer)
+
+    def _fit_controls(self, answer: Answer) -> None:
+        """Show an estimate in all but the pages, which show that of the session when they open."""
         is_scene = answer.request.source.is_scene
         if self.session.state.source == self._uploaded:  # it could be read
             self._uploaded, self.session.state.page = "", "Inspect"
@@ -505,7 +510,6 @@ class Layout:
             answer.capture.acquisition.n_bins - 1, 1
         )
         self._follow_unit()
-        self.pages.follow(answer)
 
     def _follow_unit(self) -> None:
         """Show T_n and the ends of the cut gate in the unit of the axes."""

@@ -19,7 +19,15 @@ from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
 from app.pages.inspect.pair import PairSection
 from app.pages.inspect.pins import PinsSection, pin_colors
-from app.pages.inspect.pixel import BREAK_PX, COLUMN, FILLING, NARROW, PixelSection, framed
+from app.pages.inspect.pixel import (
+    BREAK_PX,
+    COLUMN,
+    FILLING,
+    IMMEDIATE_PIXELS,
+    NARROW,
+    PixelSection,
+    framed,
+)
 from app.pages.inspect.profile import ProfileSection
 from app.pages.inspect.results import Corners
 from app.pages.inspect.views import Navigator, Pixels, rectangle
@@ -30,6 +38,7 @@ from app.pages.shared.downloads import IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.measure import pin_pixel
 from app.pages.shared.section import Section
+from app.tasks import scheduler
 from app.widgets.cards import (
     CHOICE_PX,
     FIELD_PX,
@@ -53,8 +62,8 @@ from app.widgets.controls import (
 )
 from app.widgets.image_view import CONTAINER
 from core.checks import require
-from core.inference import fit_of
-from core.inspection import FaultyPixel, faulty_pixels
+from core.inference import fit_of, has_fit
+from core.inspection import FaultyPixel, faulty_pixels, maps
 from core.io import ColorScale, RangeColors
 
 # The map with a table below on the left, plots on the right.
@@ -389,7 +398,7 @@ class Inspect(Section):
                 self.legend.text = legend(answer, kind, viewing, *drawn)
                 self._list_faulty(answer, faulty)
 
-            self.submit(work, draw)
+            self.submit(work, draw, lane=_map_lane(answer, kind))
 
     def _list_faulty(self, answer: Answer, faulty: list[FaultyPixel]) -> None:
         """Mark and list the hot and dead pixels."""
@@ -401,6 +410,14 @@ class Inspect(Section):
             columns=text.FAULTY_COLUMNS if listed else [],
             rows=[text.faulty_row(each, answer.grid) for each in listed],
         )
+
+
+def _map_lane(answer: Answer, kind: str) -> scheduler.Lane:
+    """Return where to make a map: one that takes less time than drawing it comes with the page."""
+    capture = answer.capture
+    is_small = capture.counts.size <= IMMEDIATE_PIXELS
+    is_known = has_fit(capture) and kind not in maps
+    return scheduler.PAGE if is_small and is_known else scheduler.GENERAL
 
 
 def _row(*content: Any) -> pn.Row:

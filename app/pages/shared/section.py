@@ -26,7 +26,7 @@ from app.pages.shared.downloads import (
     shown_with,
 )
 from app.pages.shared.studies import Study, aside
-from app.tasks.scheduler import Latest, Step
+from app.tasks.scheduler import Lane, Latest, Step
 from app.theme import Palette, palette
 from app.widgets.controls import Facts, SettingsPanel, Table
 from app.widgets.figures import Layers
@@ -127,8 +127,9 @@ class Section(ABC):
         draw: Callable[[Result], None],
         failed: Callable[[Exception], None] | None = None,
         own: Latest | None = None,
+        lane: Lane | None = None,
     ) -> None:
-        """Run `work` in the background and draw its result, unless it is outdated by then.
+        """Run `work` in a lane, by default in the background; draw its result unless outdated then.
 
         Work that other work of the section must neither replace nor report as successful needs a
         channel of its `own`, which is also the part of its failures.
@@ -143,7 +144,7 @@ class Section(ABC):
                     draw(result)
 
         report = partial(session.failures.report, part=part)
-        (own or self._jobs).submit(work, arrived, failed or report)
+        (own or self._jobs).submit(work, arrived, failed or report, lane)
 
     def report_error(self, error: Exception) -> None:
         """Show an error until this section works again."""
