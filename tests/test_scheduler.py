@@ -172,12 +172,17 @@ def test_each_request_of_a_channel_counts_by_itself():
         def end(self, work):
             heard.append(("end", work))
 
-    channel = Latest(page, GENERAL, Heard())
-    for _ in range(3):
-        channel.submit(int, lambda _: None, lambda _: None)
-    page.run_one()
-    page.run_one()
-    assert heard == [("begin", channel), ("end", channel)] * 2
+    channel = Latest(page, PAGE, Heard())
+
+    def ignore(_):
+        return None
+
+    channel.submit(int, ignore, ignore)  # replaced by the next
+    channel.submit(int, lambda _: channel.submit(int, ignore, ignore), ignore)
+    for n_done in (1, 2):
+        page.run_one()
+        assert heard[: 2 * n_done] == [("begin", channel), ("end", channel)] * n_done
+    assert len(heard) == 4
 
 
 # -- lanes -----------------------------------------------------------------------------------------

@@ -338,8 +338,7 @@ class GatePlot(NamedLayers):
 class PixelPlots:
     """Counts, and one plot below them, of a pixel or a region, linked along the gate.
 
-    A plot is made when it is first shown: making, sending and drawing one takes longer than all
-    else that a page needs to show a pixel.
+    A plot is made when it is first shown: a page that opens would wait for hidden ones, too.
 
     Attributes
     ----------
