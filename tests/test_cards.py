@@ -1,4 +1,4 @@
-"""What is hidden is neither made nor sent."""
+"""Hidden content is neither made nor sent."""
 
 from __future__ import annotations
 

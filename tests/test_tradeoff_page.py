@@ -15,6 +15,7 @@ from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources, scene_source
 from app.pages.layout import CUSTOM, Layout
 from app.pages.session import Session
+from app.pages.shared.outputs import table_of
 from app.pages.shared.section import Repetitions
 from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import ablation_text, text
@@ -27,6 +28,7 @@ from app.theme import DARK, LIGHT
 from core import ESTIMATORS
 from core.scene import parts_of
 from core.studies.ablation import Requirement
+from core.studies.outputs import Table
 from core.studies.sensitivity import numbers
 from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, pareto_front
 from core.studies.trials import default_methods
@@ -340,3 +342,9 @@ def open_a_configuration(here):
     open_other = f"Open: {ESTIMATORS['cfar'].title}"
     here.get_by_role("button", name=open_other, exact=True).press("Enter")
     expect(chosen(here, "Method")).to_have_text(ESTIMATORS["cfar"].title)
+
+
+def test_a_table_of_settings_has_their_symbols():
+    rows = (("tracking", "alpha"), ("tracking", "t_n"), ("likelihood", "steps_per_bin"))
+    _, shown = table_of(Table("ranges", "Ranges", ("method", "parameter"), rows))
+    assert [row["cells"][0][0] for row in shown] == ["α", "T_n", "Steps per bin"]

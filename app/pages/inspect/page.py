@@ -23,10 +23,10 @@ from app.pages.inspect.pixel import (
     BREAK_PX,
     COLUMN,
     FILLING,
-    IMMEDIATE_PIXELS,
     NARROW,
     PixelSection,
     framed,
+    is_immediate,
 )
 from app.pages.inspect.profile import ProfileSection
 from app.pages.inspect.results import Corners
@@ -414,10 +414,8 @@ class Inspect(Section):
 
 def _map_lane(answer: Answer, kind: str) -> scheduler.Lane:
     """Return where to make a map: one that takes less time than drawing it comes with the page."""
-    capture = answer.capture
-    is_small = capture.counts.size <= IMMEDIATE_PIXELS
-    is_known = has_fit(capture) and kind not in maps
-    return scheduler.PAGE if is_small and is_known else scheduler.GENERAL
+    is_quick = is_immediate(answer) and has_fit(answer.capture) and kind not in maps
+    return scheduler.PAGE if is_quick else scheduler.GENERAL
 
 
 def _row(*content: Any) -> pn.Row:

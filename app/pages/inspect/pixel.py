@@ -85,7 +85,8 @@ def stage(*content: Any) -> pn.Column:
     return pn.Column(*content, stylesheets=[COLUMN, FILLING], sizing_mode="stretch_both", margin=0)
 
 
-def _is_immediate(answer: Answer) -> bool:
+def is_immediate(answer: Answer) -> bool:
+    """Return whether a pixel is inspected where the event arrives."""
     capture = answer.capture
     is_short = capture.acquisition.n_bins <= IMMEDIATE_BINS
     return is_short and capture.counts.size <= IMMEDIATE_PIXELS
@@ -174,7 +175,7 @@ class PixelSection(Section):
             return
         answer, state = self.session.answer, self.session.state
         if self._subject == "pixel":
-            if _is_immediate(answer):
+            if is_immediate(answer):
                 with self.session.tasks.hold():
                     self._draw(inspect_pixel(answer, *state.pixel))
                 self.session.failures.resolve(self)
