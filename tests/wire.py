@@ -76,6 +76,14 @@ class Wire:
         """Fetch the page, connect its session and take over its document."""
         page = await AsyncHTTPClient().fetch(address, request_timeout=120, headers=headers)
         self._socket = await connected(address, token_in(page.body.decode()), **headers)
+        try:
+            await self._take_over()
+        except BaseException:
+            self._socket.close()
+            raise
+        self._reading = asyncio.ensure_future(self._read())
+
+    async def _take_over(self) -> None:
         self._socket.protocol.stream.set_nodelay(True)  # as in a browser
         await self._receive()
         await self._send("PULL-DOC-REQ", {})
@@ -89,7 +97,6 @@ class Wire:
         await self._send("SERVER-INFO-REQ", {})
         while await self._take() != "SERVER-INFO-REPLY":
             pass
-        self._reading = asyncio.ensure_future(self._read())
 
     def close(self) -> None:
         """Disconnect like a closed tab."""
@@ -161,16 +168,12 @@ class Wire:
         header = {"msgid": f"{kind}-{self._numbers[kind]}", "msgtype": kind}
         if buffers:
             header["num_buffers"] = len(buffers)
-        for part in (
-            header,
-            {},
-            content,
-        ):  # without a pause, so that no other message comes between
-            sent = self._socket.write_message(json.dumps(part))
+        # Without a pause, so that no other message comes between.
+        sent = [self._socket.write_message(json.dumps(part)) for part in (header, {}, content)]
         for name, buffer in buffers.items():
-            self._socket.write_message(json.dumps({"id": name}))
-            sent = self._socket.write_message(buffer, binary=True)
-        await sent
+            sent.append(self._socket.write_message(json.dumps({"id": name})))
+            sent.append(self._socket.write_message(buffer, binary=True))
+        await asyncio.gather(*sent)
 
     async def _receive(self) -> tuple[str, Any, dict[str, bytes]]:
         header = json.loads(await self._part())
