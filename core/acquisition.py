@@ -258,11 +258,15 @@ class Pulse:
         first : int
             Bin of the first tap.
         """
+        bins = self.tap_bins(n_bins, bin_width_s)
+        delay = np.asarray(delay_bin, float) - bins.start
+        return self.bin_probability(delay, len(bins), bin_width_s), bins.start
+
+    def tap_bins(self, n_bins: int, bin_width_s: float) -> range:
+        """Return the bins of the taps of `taps`, relative to the delay."""
         # If the gate closes before the echo arrives, its last bin is the only tap.
         first = math.floor(min(max(self.quantile_s(1e-3) / bin_width_s, -n_bins), n_bins - 1))
-        end = math.ceil(min(self.quantile_s(1 - 1e-3) / bin_width_s, n_bins)) + 1
-        delay = np.asarray(delay_bin, float) - first
-        return self.bin_probability(delay, end - first, bin_width_s), first
+        return range(first, math.ceil(min(self.quantile_s(1 - 1e-3) / bin_width_s, n_bins)) + 1)
 
     def cumulative(self, onset_bin: ArrayLike, n_bins: int, bin_width_s: float) -> Floats:
         """Share of the photons before each bin edge.

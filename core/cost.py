@@ -239,14 +239,14 @@ def cost_of(
     capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
 ) -> Cost:
     """Predict working memory and time of an estimate of a capture; see `predicted`."""
-    echo, _ = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
     rows, cols, n_bins = capture.cube.shape
+    taps = capture.pulse.tap_bins(n_bins, capture.acquisition.bin_width_s)
     return predicted(
         (rows, cols, n_bins),
         method,
         settings,
         false_alarm=false_alarm,
-        n_taps=echo.size,
+        n_taps=len(taps),
         n_groups=n_groups_of(capture),
         posterior_is_cached=has_posterior(capture),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from operator import is_not
 from pathlib import Path
 from typing import Any
 
@@ -262,6 +263,7 @@ class Layout:
         )
         self.pages.choice.param.update(sx=PAGE_BUTTONS, margin=(0, 0, 0, 8))
         self.page = self._template()
+        self._subject: tuple[object, ...] = (None,) * 6
         self._fit_controls(session.answer)
         self._listen()
         if arrivals is not None:
@@ -424,9 +426,7 @@ class Layout:
         session.failures.shown.subscribe(self._show_failure)
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
-        state.param.watch(
-            lambda *_: self._show_settings("light", "tracking"), ["light", "budget", "tracking"]
-        )
+        state.param.watch(lambda *_: self._show_changed(), ["light", "budget", "tracking"])
         self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
@@ -490,25 +490,35 @@ class Layout:
 
     def _fit_controls(self, answer: Answer) -> None:
         """Show an estimate in all but the pages, which show that of the session when they open."""
+        state = self.session.state
+        if state.source == self._uploaded:  # it could be read
+            self._uploaded, state.page = "", "Inspect"
+        if self._source.value != state.source:
+            self._source.value = state.source
+        request = answer.request
+        read = request.reading, request.absent, self.session.estimate.refused
+        subject = answer.whole, answer.capture, answer.method, *read
+        if any(map(is_not, subject, self._subject)):
+            self._subject = subject
+            self._fit_to(answer)
+        self._method.show(answer)
+        self._budget.refresh()
+        self._describe_print()
+        self._show_settings()
+
+    def _fit_to(self, answer: Answer) -> None:
+        """Show a capture and the kind of its estimate, which few settings change."""
         is_scene = answer.request.source.is_scene
-        if self.session.state.source == self._uploaded:  # it could be read
-            self._uploaded, self.session.state.page = "", "Inspect"
-        self._source.value = self.session.state.source
         self._light_part.visible = is_scene
         self._reading.part.visible = not is_scene
         self._truth.show(answer)
         self._show_reading(answer)
         self._truth_offer.show(answer)
         self._provenance.text = text.provenance(answer)[:2000]
-        self._method.show(answer)
-        self._budget.refresh()
-        self._panels["tracking"].mark_doubts(doubts_hold(answer.capture))
+        tracking = self._panels["tracking"]
+        tracking.mark_doubts(doubts_hold(answer.capture))
+        tracking.controls["t_n"].high = max(answer.capture.acquisition.n_bins - 1, 1)
         self._fit_sidebar()
-        self._describe_print()
-        self._show_settings()
-        self._panels["tracking"].controls["t_n"].high = max(
-            answer.capture.acquisition.n_bins - 1, 1
-        )
         self._follow_unit()
 
     def _follow_unit(self) -> None:
@@ -530,14 +540,27 @@ class Layout:
             n_records = answer.whole.n_records
             self._reading.show(answer.request.reading, options_in_use(answer), n_records)
 
-    def _show_settings(self, *names: str) -> None:
-        """Show settings that were changed by a page, a preset or an estimate; all by default."""
-        state = self.session.state
-        for name in names or self._panels:
-            is_light = name == "light"
-            chosen = self.session.request.illumination if is_light else getattr(state, name)
-            self._panels[name].show(chosen)
-        self._preset.value = _preset_of(state.tracking)
+    def _show_settings(self) -> None:
+        """Show the settings of the state."""
+        for name, panel in self._panels.items():
+            panel.show(self._chosen(name))
+        self._show_preset()
+
+    def _show_changed(self) -> None:
+        """Show settings that a page or a preset has changed, or a slider, which shows its own."""
+        for name, panel in self._panels.items():
+            if panel.settings != self._chosen(name):
+                panel.show(self._chosen(name))
+        self._show_preset()
+
+    def _show_preset(self) -> None:
+        preset = _preset_of(self.session.state.tracking)
+        if self._preset.value != preset:
+            self._preset.value = preset
+
+    def _chosen(self, name: str) -> Any:
+        is_light = name == "light"
+        return self.session.request.illumination if is_light else getattr(self.session.state, name)
 
     # Actions of the user
 

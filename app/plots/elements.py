@@ -384,13 +384,18 @@ READ_OUT = """
 if (format === "column") return String(Math.round(value));
 const found = source.data.image[0][special_vars.image_index.flat_index];
 if (!Number.isFinite(found)) return "none shown";
-return `${Number(found.toPrecision(5))} ${unit}`.replace(/e[+]?(-?\\d+)/, " × 10^$1");
+return `${Number(found.toPrecision(5))} ${source.tags}`.replace(/e[+]?(-?\\d+)/, " × 10^$1");
 """
 
 
 def value_read_out(picture: Any, unit: str = "") -> HoverTool:
-    """Return a tool that shows row, column and value of an image's pixel under the pointer."""
-    shown = CustomJSHover(args={"source": picture.data_source, "unit": unit}, code=READ_OUT)
+    """Return a tool that shows row, column and value of an image's pixel under the pointer.
+
+    The unit remains in the tags of the image's source: Bokeh would walk through the whole page if
+    arguments of the tool were replaced.
+    """
+    picture.data_source.tags = [unit]
+    shown = CustomJSHover(args={"source": picture.data_source}, code=READ_OUT)
     tips = [("Row", "$y{0}"), ("Column", "$x{column}"), ("Value", "$x{value}")]
     return HoverTool(renderers=[picture], tooltips=tips, formatters={"$x": shown})
 

@@ -19,8 +19,14 @@ class Component(JSComponent):
 
     For each value Panel looks up the design, walks through all models below the component and
     searches for references, in case it is a style sheet, a child or a model. That is most of the
-    cost of a plain value, and a slider move changes many.
+    cost of a plain value, and a slider move changes many. Most values stay the same in a move, for
+    which a comparison is all that is needed.
     """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        kind: Any = type(self)
+        if name not in _plain(kind) or getattr(self, name) != value:
+            super().__setattr__(name, value)
 
     def _update_properties(self, *events: Any, doc: Any) -> dict[str, Any]:
         values = {event.name: event.new for event in events}

@@ -99,8 +99,8 @@ class Knob(Component):
 
     def follow(self, along: Scale, n_bins: int = 1) -> None:
         """Show edges of bins in a unit; the values are shares of `n_bins`, or bins by default."""
-        shown = [along.origin, along.step * n_bins, along.edge_decimals]
-        self.param.update(unit=along.name, along=shown, parts=n_bins)
+        self.unit, self.parts = along.name, n_bins
+        self.along = [along.origin, along.step * n_bins, along.edge_decimals]
 
 
 # As in knob.css.
@@ -118,10 +118,15 @@ class SettingsPanel(Generic[Settings]):
         Frozen, its fields made by `core.parameters.parameter`.
     changed : callable
         Called with the new settings object after each change by the user.
+
+    Attributes
+    ----------
+    settings : dataclass
+        What the controls show.
     """
 
     def __init__(self, settings: Settings, changed: Callable[[Settings], None]) -> None:
-        self._settings = settings
+        self.settings = settings
         self._changed = changed
         self._silent = False
         self._doubts_hold = True
@@ -169,11 +174,11 @@ class SettingsPanel(Generic[Settings]):
         if hold == self._doubts_hold:
             return
         self._doubts_hold = hold
-        for field in fields(self._settings):  # type: ignore[arg-type]
+        for field in fields(self.settings):  # type: ignore[arg-type]
             spec = spec_of(field)
             if isinstance(spec, Number):
                 self.controls[field.name].doubtful = _zones(spec) if hold else []
-        self._accept(self._settings)
+        self._accept(self.settings)
 
     def _collect(self, _event: param.parameterized.Event) -> None:
         if self._silent:
@@ -183,7 +188,7 @@ class SettingsPanel(Generic[Settings]):
             for name, control in self.controls.items()
         }
         try:
-            settings = replace(self._settings, **values)  # type: ignore[type-var]
+            settings = replace(self.settings, **values)  # type: ignore[type-var]
         except ValueError as error:  # values that exclude each other
             text = str(error)
             for name, control in self.controls.items():
@@ -194,7 +199,7 @@ class SettingsPanel(Generic[Settings]):
         self._changed(settings)
 
     def _accept(self, settings: Settings) -> None:
-        self._settings = settings
+        self.settings = settings
         self.doubts.text = " ".join(joint_doubts(settings)) if self._doubts_hold else ""
 
 

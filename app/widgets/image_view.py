@@ -65,9 +65,7 @@ class ImageView:
         # Else Bokeh activates the first of the tools that HoloViews adds.
         self.figure.toolbar.active_drag = zoom
 
-        hover = plots.value_read_out(picture["glyph_renderer"])
-        self._read_out = hover.formatters["$x"]
-        self.figure.add_tools(hover)
+        self.figure.add_tools(plots.value_read_out(picture["glyph_renderer"]))
 
         def tap(event: Tap) -> None:
             row, col = self._grid.pixel(event.y, event.x)
@@ -143,7 +141,7 @@ class ImageView:
         )
         self._bar.title = look.unit
         self._bar.ticker.min_interval = 1 if look.whole else 0
-        self._read_out.args = {"source": self._plot.source("picture"), "unit": look.unit}
+        self._plot.source("picture").tags = [look.unit]  # for the pointer
         self.figure.title.text = look.title
 
     @property

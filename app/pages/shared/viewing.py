@@ -9,7 +9,6 @@ from app.widgets.controls import SettingsPanel
 
 def show_own_width(panel: SettingsPanel[Viewing], answer: Answer) -> None:
     """Show the field of view for which an empty field stands, and whether it is a guess."""
-    is_guessed = answer.is_width_guessed(Viewing())
-    panel.controls["field_of_view_deg"].param.update(
-        substitute=answer.own_field_of_view_deg, empty="guess" if is_guessed else ""
-    )
+    field = panel.controls["field_of_view_deg"]
+    field.substitute = answer.own_field_of_view_deg
+    field.empty = "guess" if answer.is_width_guessed(Viewing()) else ""
