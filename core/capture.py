@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, update_wrapper
 from typing import (
@@ -282,11 +283,16 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
-class cached_per_capture(Generic[_Arguments, _Result]):
-    """Decorator that caches the results of a function of a capture for the capture's lifetime.
+MOST_CACHED = 64
+"""Results of a function that are kept for a capture."""
 
-    The function must be deterministic and its other arguments hashable. Its result must not refer
-    to the capture, which could then never be freed.
+
+class cached_per_capture(Generic[_Arguments, _Result]):
+    """Decorator that caches results of a function of a capture for the capture's lifetime.
+
+    Those of the latest `MOST_CACHED` arguments are kept. The function must be deterministic and its
+    other arguments hashable. Its result must not refer to the capture, which could then never be
+    freed.
     """
 
     def __init__(self, compute: Callable[Concatenate[Capture, _Arguments], _Result]) -> None:
@@ -300,9 +306,12 @@ class cached_per_capture(Generic[_Arguments, _Result]):
         """Return the cached result, or compute it."""
         results = self._results.setdefault(capture, {})
         key = (args, *kwargs.items())
-        if key not in results:
-            results.setdefault(key, self._compute(capture, *args, **kwargs))
-        return results[key]
+        with suppress(KeyError):
+            return results[key]
+        result = results.setdefault(key, self._compute(capture, *args, **kwargs))
+        for oldest in list(results)[:-MOST_CACHED]:
+            results.pop(oldest, None)  # another thread may have done so
+        return result
 
     def is_cached(self, capture: Capture) -> bool:
         """Return whether any result of a capture is cached."""

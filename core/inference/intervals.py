@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Floats, Pulse
-from core.capture import Capture
+from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.inference.flux import LEVEL_SPAN, LEVELS, flux_model_of
 from core.inference.posterior import TOLERANCE_BINS
@@ -109,14 +109,21 @@ def pixel_range_intervals(
     tuple of Interval
         The estimate and its limits in metres; NaN without an estimate.
     """
-    estimate_m = float(image.range_m[row, col])
-    tails = _all_tails(levels)
-    limits_m = np.full((tails.size, 1), np.nan)
+    estimate_m, limits_m = float(image.range_m[row, col]), np.full((len(levels), 2), np.nan)
     if image.valid[row, col]:
-        pixel = np.array([row * capture.shape[1] + col])
-        limits = _quantiles_bins(capture, pixel, image.bin[row, col : col + 1], tails)
+        limits = _limits_bins(capture, row, col, float(image.bin[row, col]), tuple(levels))
         limits_m = capture.acquisition.bin_to_range_m(limits)
-    return tuple(Interval(estimate_m, *each) for each in limits_m.reshape(-1, 2).tolist())
+    return tuple(Interval(estimate_m, *each) for each in limits_m.tolist())
+
+
+@cached_per_capture
+def _limits_bins(
+    capture: Capture, row: int, col: int, estimate_bin: float, levels: tuple[float, ...]
+) -> Floats:
+    """Limits (level, 2) of the delay of a pixel near an estimate, which few settings move."""
+    pixel = np.array([row * capture.shape[1] + col])
+    tails = _all_tails(levels)
+    return _quantiles_bins(capture, pixel, np.array([estimate_bin]), tails).reshape(-1, 2)
 
 
 def delay_range_interval(

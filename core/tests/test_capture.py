@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from core.acquisition import Acquisition, Pulse
-from core.capture import Capture, cached_per_capture
+from core.capture import MOST_CACHED, Capture, cached_per_capture
 from core.inference.flux import flux_prior_of
 
 
@@ -67,6 +67,25 @@ def test_a_result_is_computed_once_for_each_capture_and_argument() -> None:
     assert calls == [(one, 1), (one, 3), (other, 1)]
     assert total.is_cached(one) and not total.is_cached(replace(one))
     assert (total.__name__, total.__doc__) == ("total", "Counts times a factor.")
+
+
+def test_only_the_latest_results_are_kept() -> None:
+    calls = []
+
+    @cached_per_capture
+    def number(capture: Capture, given: int) -> int:
+        calls.append(given)
+        return given
+
+    capture = capture_of(np.ones((1, 1, 1)))
+    latest = [*range(1, MOST_CACHED + 1)]
+    assert [number(capture, given) for given in (0, *latest, *latest, 0)] == [
+        0,
+        *latest,
+        *latest,
+        0,
+    ]
+    assert calls == [0, *latest, 0]
 
 
 def test_none_is_cached_and_an_error_is_not() -> None:
