@@ -215,6 +215,18 @@ def test_page_work_runs_at_once_on_a_page_that_is_at_hand():
     assert page.waiting.empty()
 
 
+def test_short_work_waits_for_the_turn_of_its_page():
+    page = HeldTasks()
+    client = Client(page, is_free=True)
+    for name in ("first", "second"):
+        client.submit(name, SHORT)
+    assert client.ran == []
+    page.run_one()
+    page.run_one()
+    assert client.ran == client.done == ["second"]
+    assert client.threads != [threading.current_thread()]
+
+
 @pytest.mark.parametrize("lane", [SHORT, GENERAL])
 def test_longer_work_that_replaces_page_work_runs_on_a_thread(lane):
     page = HeldTasks()

@@ -102,7 +102,8 @@ PAGE = Lane(0, "page")
 for the interpreter, which takes several times as long."""
 
 SHORT = Lane(1, "firstphoton-short")
-"""Some tens of milliseconds, one request at a time: parallel ones would slow each other down."""
+"""Some tens of milliseconds, one request at a time: parallel ones would slow each other down. Each
+waits for its page's turn, as shorter ones do, so that a few pages do not slow down all others."""
 
 GENERAL = Lane(4, "firstphoton")
 """Unknown cost, such as reading a file. Kernels that use all cores have a lock of their own."""
@@ -183,12 +184,14 @@ class Latest:
     def _start(self) -> None:
         assert self._newest is not None
         lane = self._newest.lane
-        if lane is not PAGE:
-            lane.acquire(partial(self._attempt, lane), partial(self._refuse, lane))
-        elif self._page.is_at_hand:
-            self._attempt(PAGE)
+        begin = partial(self._attempt, PAGE) if lane is PAGE else partial(self._acquire, lane)
+        if lane in (PAGE, SHORT) and not self._page.is_at_hand:
+            self._page.queue(begin)
         else:
-            self._page.queue(partial(self._attempt, PAGE))
+            begin()
+
+    def _acquire(self, lane: Lane) -> None:
+        lane.acquire(partial(self._attempt, lane), partial(self._refuse, lane))
 
     def _take(self) -> _Request:
         with self._lock:
@@ -198,10 +201,13 @@ class Latest:
 
     def _attempt(self, lane: Lane) -> None:
         assert self._newest is not None
-        if self._newest.lane is not lane:  # replaced by a request for another lane
-            if lane is not PAGE:
+        newest = self._newest.lane
+        if newest is not lane:  # replaced by a request for another lane
+            if lane is PAGE:  # its turn has come
+                self._acquire(newest)
+            else:
                 lane.release()
-            self._start()
+                self._start()
             return
         request = self._take()
         draw = partial(self._finish, request.run(), request.failed)
