@@ -243,8 +243,8 @@ def expect_a_steady_frame(page: Page) -> None:
 
 READ_OUT = """(values) => {
   const Hover = Bokeh.Models.get("CustomJSHover");
-  const source = { data: { image: [values] } };
-  const hover = new Hover({ args: { source, unit: "m" }, code: CODE });
+  const source = { data: { image: [values] }, tags: ["m"] };
+  const hover = new Hover({ args: { source }, code: CODE });
   return values.map((_, k) => hover.format(0, "value", { image_index: { flat_index: k } }));
 }"""
 """Texts under the pointer for some values of a map."""

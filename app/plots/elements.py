@@ -384,7 +384,8 @@ READ_OUT = """
 if (format === "column") return String(Math.round(value));
 const found = source.data.image[0][special_vars.image_index.flat_index];
 if (!Number.isFinite(found)) return "none shown";
-return `${Number(found.toPrecision(5))} ${source.tags}`.replace(/e[+]?(-?\\d+)/, " × 10^$1");
+const [unit] = source.tags;
+return `${Number(found.toPrecision(5))} ${unit}`.replace(/e[+]?(-?\\d+)/, " × 10^$1");
 """
 
 
