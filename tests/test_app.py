@@ -10,6 +10,7 @@ import numpy as np
 import panel_material_ui as pmui
 import pytest
 from bokeh.document import Document
+from bokeh.document.models import DocumentModelManager
 
 import core
 from app.model import colors as looks
@@ -495,6 +496,19 @@ def test_an_image_is_shown_with_its_scale_and_its_frame(car):
     for data in frames:
         middle = (data["left"][0] + data["right"][0]) / 2, (data["top"][0] + data["bottom"][0]) / 2
         assert middle == (5, 3)
+
+
+def test_another_kind_of_image_does_not_search_the_page_for_models(car, monkeypatch):
+    view = ImageView(lambda row, col: None)
+    view.enter(64, 64, car.grid)
+    view.update(*looks.image_of(car, "Estimate", Viewing()))
+    document = Document()
+    document.add_root(view.figure)
+    searched = []
+    monkeypatch.setattr(DocumentModelManager, "recompute", searched.append)
+    view.update(*looks.image_of(car, "Counts", Viewing()))
+    assert view.figure.title.text.startswith("Detections")
+    assert searched == []
 
 
 @pytest.mark.parametrize(
