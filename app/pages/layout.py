@@ -263,7 +263,7 @@ class Layout:
         )
         self.pages.choice.param.update(sx=PAGE_BUTTONS, margin=(0, 0, 0, 8))
         self.page = self._template()
-        self._subject: tuple[object, ...] = (None,) * 6
+        self._subject: tuple[object, ...] = ()
         self._fit_controls(session.answer)
         self._listen()
         if arrivals is not None:
@@ -498,7 +498,7 @@ class Layout:
         request = answer.request
         read = request.reading, request.absent, self.session.estimate.refused
         subject = answer.whole, answer.capture, answer.method, *read
-        if any(map(is_not, subject, self._subject)):
+        if not self._subject or any(map(is_not, subject, self._subject)):
             self._subject = subject
             self._fit_to(answer)
         self._method.show(answer)

@@ -109,21 +109,22 @@ def pixel_range_intervals(
     tuple of Interval
         The estimate and its limits in metres; NaN without an estimate.
     """
-    estimate_m, limits_m = float(image.range_m[row, col]), np.full((len(levels), 2), np.nan)
+    estimate_m = float(image.range_m[row, col])
+    tails = _all_tails(levels)
+    limits_m = np.full(tails.size, np.nan)
     if image.valid[row, col]:
-        limits = _limits_bins(capture, row, col, float(image.bin[row, col]), tuple(levels))
+        limits = _limits_bins(capture, row, col, float(image.bin[row, col]), tuple(tails))
         limits_m = capture.acquisition.bin_to_range_m(limits)
-    return tuple(Interval(estimate_m, *each) for each in limits_m.tolist())
+    return tuple(Interval(estimate_m, *each) for each in limits_m.reshape(-1, 2).tolist())
 
 
 @cached_per_capture
 def _limits_bins(
-    capture: Capture, row: int, col: int, estimate_bin: float, levels: tuple[float, ...]
+    capture: Capture, row: int, col: int, estimate_bin: float, shares: tuple[float, ...]
 ) -> Floats:
-    """Limits (level, 2) of the delay of a pixel near an estimate, which few settings move."""
+    """Quantiles (share,) of the delay of a pixel near an estimate, which few settings move."""
     pixel = np.array([row * capture.shape[1] + col])
-    tails = _all_tails(levels)
-    return _quantiles_bins(capture, pixel, np.array([estimate_bin]), tails).reshape(-1, 2)
+    return _quantiles_bins(capture, pixel, np.array([estimate_bin]), np.array(shares))[:, 0]
 
 
 def delay_range_interval(

@@ -152,11 +152,13 @@ def test_the_interval_of_a_pixel_is_that_of_the_image() -> None:
 def test_a_level_that_is_no_probability_is_refused() -> None:
     capture = drawn(Pulse(), 300)
     image = estimate(capture, "peak")
+    empty = replace(image, valid=np.zeros_like(image.valid))
     for level in (0.0, 1.0, math.nan):
         with pytest.raises(ValueError, match=r"level = .* between 0 and 1"):
             core.range_interval(capture, image, level)
-        with pytest.raises(ValueError, match=r"level = .* between 0 and 1"):
-            core.pixel_range_intervals(capture, image, 0, 0, (level,))
+        for each in (image, empty):
+            with pytest.raises(ValueError, match=r"level = .* between 0 and 1"):
+                core.pixel_range_intervals(capture, each, 0, 0, (level,))
     other = replace(capture, cube=capture.cube[:5], truth_range_m=None, flux_prior=None)
     with pytest.raises(ValueError, match="image = "):
         core.range_interval(other, image)
