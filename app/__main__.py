@@ -63,6 +63,9 @@ from core.io import (
 
 log = logging.getLogger(__name__)
 
+FREEZE_AFTER_S = 1.0
+"""Time after a page is built until its objects are frozen: its browser draws it then."""
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Serve until interrupted; return the exit code."""
@@ -265,7 +268,8 @@ def page_for(
     """Return the page of a new session, or a sentence if it cannot be built."""
     if pn.state.curdoc is not None:
         pn.state.curdoc.template_variables["scripts"] = scripts()
-        pn.state.onload(garbage.freeze_all)
+        freeze_later = partial(IOLoop.current().call_later, FREEZE_AFTER_S, garbage.freeze_all)
+        pn.state.onload(freeze_later)
     try:
         return build_page(sources, uploads, arrivals, lessons)
     except Exception:

@@ -364,12 +364,12 @@ class Layout:
         }
 
     def _template(self) -> Template:
-        head = pn.Column(
+        head = pmui.Column(
             self._link,
             self._connection,
             Glossary(margin=0),
             self._tour,
-            arriving(self._busy),
+            self._busy,
             self.alert,
             self._reading.question,
             sizing_mode="stretch_width",

@@ -162,7 +162,7 @@ class TruthOffer:
         self._jobs.submit(partial(offered_truths, answer), offer, self._log)
 
     def _offer(self, subject: Any, found: Sequence[PossibleTruth]) -> None:
-        if subject == self._subject:  # else outdated
+        if found and subject == self._subject:  # else outdated
             self._ask(OFFER, [_button(_label(each), HELP, self._choose, each) for each in found])
 
     def _choose(self, truth: PossibleTruth) -> None:
@@ -180,7 +180,7 @@ class TruthOffer:
     def _ask(self, question: str, buttons: Sequence[Any]) -> None:
         asked = Sentence(text=question, live=True, sizing_mode="stretch_width", margin=(4, 8))
         self.layout[:] = [asked, pn.FlexBox(*buttons)]
-        self.layout.visible = bool(buttons)
+        self.layout.visible = True
 
     def _log(self, error: Exception) -> None:
         log.warning("could not list the images of a capture's file", exc_info=error)
