@@ -364,7 +364,7 @@ class Layout:
         }
 
     def _template(self) -> Template:
-        head = pmui.Column(
+        head = pn.Column(
             self._link,
             self._connection,
             Glossary(margin=0),
@@ -380,7 +380,8 @@ class Layout:
         return Template(
             title="firstphoton",
             template=TEMPLATE,
-            sidebar=self._sidebar(),
+            # In the template itself, each part that opens would lay out the plots again.
+            sidebar=[pmui.Column(*self._sidebar(), sizing_mode="stretch_width", margin=0)],
             header=[self.pages.choice, tour],  # not in `main`: plots keep the height
             main=[head, *self.pages.mains.values(), self._provenance, self._printed],
             sidebar_width=330,

@@ -113,15 +113,8 @@ class Pages:
         self._builders = builders
         self._built: dict[str, View] = {}
         self._dark = False
-        self.mains = {
-            name: pn.Column(visible=False, stylesheets=[HOLDER], margin=(0, 12))
-            for name in builders
-        }
-        # A part that folds, in a Bokeh column of the template, would lay out all plots again.
-        self.asides = {
-            name: pmui.Column(visible=False, sizing_mode="stretch_width", margin=0)
-            for name in builders
-        }
+        self.mains = {name: _holder(margin=(0, 12)) for name in builders}
+        self.asides = {name: _holder(margin=0) for name in builders}
         self.choice = pmui.RadioButtonGroup(
             options=list(builders),
             value=first or next(iter(builders)),
@@ -173,6 +166,10 @@ class Pages:
             self.asides[name].extend(_several(view.aside))
             self._built[name] = view
         self.mains[name].visible = self.asides[name].visible = True
+
+
+def _holder(margin: Any) -> pn.Column:
+    return pn.Column(visible=False, stylesheets=[HOLDER], margin=margin)
 
 
 def _several(content: Any) -> Sequence[Any]:

@@ -164,9 +164,9 @@ def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True)
     return sent_when_visible(made)
 
 
-def arriving(*parts: Any) -> pmui.Column:
+def arriving(*parts: Any) -> pn.Column:
     """Return a column of parts, each of which is sent when it is first visible."""
-    made = pmui.Column(sizing_mode="stretch_width", margin=0)
+    made = pn.Column(sizing_mode="stretch_width", margin=0)
 
     def send(*_: Any) -> None:
         sent = [each for each in parts if each.visible or each in made.objects]
