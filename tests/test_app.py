@@ -1056,7 +1056,8 @@ def test_estimates_without_an_echo_are_those_of_the_estimate_on_screen(
 
 def help_on(layout):
     """Return the texts of the help at the top of the sidebar."""
-    help = layout.page.sidebar[0]
+    [sidebar] = layout.page.sidebar
+    help = sidebar[0]
     assert help.title == HELP
     help.collapsed = False
     return [each.object for each in help.select(pmui.Typography)] if help.visible else []
