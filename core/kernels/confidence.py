@@ -30,7 +30,8 @@ def fill_highest(ratio, highest):  # type: ignore[no-untyped-def]
     takes several times as long as storing everywhere.
     """
     last, higher = len(ratio) - 1, np.empty_like(highest)
-    highest[:] = ratio[last]
+    for i in range(highest.size):
+        highest[i] = ratio[last, i]
     for d in range(0, last, 2):
         for i in range(highest.size):
             here, most = ratio[d, i], highest[i]
@@ -148,7 +149,8 @@ def _fill_density(b, prepared, ratio, offset, density, top):  # type: ignore[no-
         at = (level - 1) % len(ratio)
         fill_level(b, level, prepared, fired, armed, ratio[at])
         fill_flat(b, level, prepared, all_fired, all_unfired, offset[at])
-        offset[at] += prepared.log_share[level]
+        for i in range(lanes):
+            offset[at, i] += prepared.log_share[level]
         add_level(ratio[at], offset[at], density, top)
     for d in range(n_delays):
         for i in range(lanes):

@@ -262,8 +262,7 @@ def fill_level(b, level, prepared, fired, armed, ratio):  # type: ignore[no-unty
     n_nodes, n_bins, lanes = fired.shape
     n_steps, n_taps = prepared.echo.shape
     gain = lane_rows(n_steps * n_taps, lanes).reshape(n_steps, n_taps, lanes)
-    signal = np.empty(lanes, np.float32)
-    signal[:] = prepared.signal[level, b]
+    signal = prepared.signal[level, b].astype(np.float32)
     for step in range(n_steps):
         tail = prepared.echo_tail[step]
         for d in range(n_bins):

@@ -93,7 +93,8 @@ def draw_pulses(first, end, triggered, first_pulse, end_pulse, seed, cube):  # t
     n_bins = cube.shape[1]
     for pixel in range(first, end):
         fired_by = np.full(n_bins + 1, 2.0)
-        fired_by[:n_bins] = triggered[pixel, 1:]
+        for k in range(n_bins):
+            fired_by[k] = triggered[pixel, 1 + k]
         guide = np.empty(_CELLS + 1, np.uint32)
         uniform = np.empty(64)
         counts = np.zeros(n_bins + 1, np.int64)
