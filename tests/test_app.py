@@ -1090,3 +1090,16 @@ def test_sessions_share_no_control_and_no_source(own_layout):
     assert not knobs[0] & knobs[1]
     own_layout.session.sources["mine"] = own_layout.session.sources["car"]
     assert "mine" not in other.session.sources
+
+
+def test_only_the_first_estimate_of_a_scene_is_shared_and_only_where_requests_are_equal(tmp_path):
+    path = tmp_path / "capture.npz"
+    save_capture(core.simulate(core.scenes["wall"](16), Acquisition(), core.Flux(), seed=0), path)
+    sources = built_in_sources() | {"file": file_source(path)}
+
+    def opened(**chosen):
+        return HeldLayout(sources, Link(chosen)).session.answer
+
+    assert opened() is opened()
+    assert opened(**{"light.sbr": "0.2"}) is not opened()
+    assert opened(source="file") is not opened(source="file")

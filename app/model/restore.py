@@ -18,6 +18,7 @@ from app.model.store import (
     Request,
     Source,
     compute,
+    first_answer,
     is_ambiguous,
 )
 from core import CaptureError
@@ -117,7 +118,7 @@ def _first_answer(
         state.param.update(before | attempt)
         request = request_of(state, sources)
         try:
-            answer = compute(request, None)
+            answer = first_answer(request)
         except Exception as error:  # the page reports any failure
             _report(error, link)
             if refused is None and not request.source.is_scene:
@@ -125,7 +126,7 @@ def _first_answer(
         else:
             is_open = refused is None or answer.request.source is refused.request.source
             return answer, None if is_open else refused
-    return compute(request_of(state, sources), None), refused
+    return first_answer(request_of(state, sources)), refused
 
 
 def parsed(

@@ -59,6 +59,7 @@ from core.metrics import Interval
 
 NO_OPTIONS = ReadOptions()
 _END_BYTES, _FILES_READ = 2**16, 16
+_SCENES_KEPT = 2  # whose estimates are kept for the next sessions
 ASSETS = Path(str(resources.files("assets")))
 
 
@@ -402,6 +403,16 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     else:
         width_deg = _own_field_of_view_deg(estimated)
     return Answer(request, estimated, capture_s + flux_s, whole, width_deg, cutout, requested)
+
+
+def first_answer(request: Request) -> Answer:
+    """Compute an estimate without a previous one; sessions share that of a scene."""
+    return _answer_of_scene(request) if request.source.is_scene else compute(request, None)
+
+
+@lru_cache(maxsize=_SCENES_KEPT)
+def _answer_of_scene(request: Request) -> Answer:
+    return compute(request, None)
 
 
 def _own_field_of_view_deg(run: Run) -> float:
