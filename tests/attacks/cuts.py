@@ -6,7 +6,7 @@ import re
 import time
 from pathlib import Path
 
-from playwright.sync_api import Page
+from playwright.sync_api import Locator, Page
 
 from tests.attacks.attack import Attack, Outcome, running
 from tests.attacks.proxy import proxy
@@ -15,9 +15,14 @@ from tests.browser import chromium, eventually
 CUT_S = 20.0
 
 
+def shown(page: Page, pattern: str) -> Locator:
+    """Return the first of the texts on screen that match a pattern."""
+    return page.get_by_text(re.compile(pattern)).filter(visible=True).first
+
+
 def done(page: Page) -> int:
     """Return the number of steps of the study that the page reports."""
-    text = page.get_by_text(re.compile(r"^(\d+ of \d+|Done: \d+) ")).filter(visible=True).first
+    text = shown(page, r"^(\d+ of \d+|Done: \d+) ")
     return int(re.findall(r"\d+", text.inner_text())[0])
 
 
@@ -32,7 +37,7 @@ def study(_folder: Path) -> Outcome:
         page = browser.new_page()
         page.goto(f"http://127.0.0.1:{between.port}/?page=Trade-off")
         page.get_by_role("button", name=re.compile("^Compute")).press("Enter")
-        page.get_by_text(re.compile("^[1-9]\\d* of ")).wait_for(timeout=60_000)
+        shown(page, r"^[1-9]\d* of ").wait_for(timeout=60_000)
         before, begun = done(page), time.monotonic()
         between.cut()
         lost = page.get_by_role("alertdialog").filter(has_text="connection to the server is lost")
