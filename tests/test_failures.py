@@ -451,7 +451,7 @@ def test_the_form_is_open_for_a_file_that_a_link_names_and_that_is_refused(tmp_p
 
 
 def test_a_link_to_an_unreadable_file_shows_no_folder(monkeypatch):
-    raised, link = breaking(monkeypatch, "app.model.restore.compute"), Link({"seed": "3"})
+    raised, link = breaking(monkeypatch, "app.model.restore.first_answer"), Link({"seed": "3"})
     for error in ERRORS:
         raised[:] = [error]
         with pytest.raises(type(error)):
