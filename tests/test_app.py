@@ -1057,6 +1057,7 @@ def test_estimates_without_an_echo_are_those_of_the_estimate_on_screen(
 def help_on(layout):
     """Return the texts of the help at the top of the sidebar."""
     [sidebar] = layout.page.sidebar
+    assert isinstance(sidebar, pmui.Column)  # in which a part lays out no plot
     help = sidebar[0]
     assert help.title == HELP
     help.collapsed = False

@@ -42,7 +42,7 @@ def restore(
     own : mapping
         Defaults of this session that differ from the state's.
     """
-    answer, refused = _first_answer(state, sources, link, own)
+    answer, refused = _restored_answer(state, sources, link, own)
     enter(state, answer, None)
     state.param.update(places(link, answer))
     link.refuse_others()
@@ -102,7 +102,7 @@ def choices(link: Link, own: Mapping[str, Any]) -> dict[str, Any]:
     return base | link.of(base)
 
 
-def _first_answer(
+def _restored_answer(
     state: State, sources: Mapping[str, Source], link: Link, own: Mapping[str, Any]
 ) -> tuple[Answer, Refused | None]:
     before, changed = {**defaults(), **own}, choices(link, own)

@@ -407,12 +407,10 @@ def compute(request: Request, previous: Answer | None) -> Answer:
 
 def first_answer(request: Request) -> Answer:
     """Compute an estimate without a previous one; sessions share that of a scene."""
-    return _answer_of_scene(request) if request.source.is_scene else compute(request, None)
+    return (_kept if request.source.is_scene else compute)(request, None)
 
 
-@lru_cache(maxsize=_SCENES_KEPT)
-def _answer_of_scene(request: Request) -> Answer:
-    return compute(request, None)
+_kept = lru_cache(maxsize=_SCENES_KEPT)(compute)
 
 
 def _own_field_of_view_deg(run: Run) -> float:
