@@ -343,10 +343,12 @@ def echo_model(capture: Capture, background: Floats | None = None) -> EchoModel:
     n_bins, width_s = capture.acquisition.n_bins, capture.acquisition.bin_width_s
     echo, first = capture.pulse.taps(n_bins, width_s, np.linspace(0.0, 1.0, _STEPS + 1))
     n_pulses = capture.gated_pulses
+    shares = _background_shares(capture) if background is None else background
     return EchoModel(
         echo,
         first,
-        _background_shares(capture) if background is None else background,
+        shares,
+        bool((shares == shares[0]).all()),
         n_pulses is not None,
         float(n_pulses or 1),
         resolved_bins(capture),

@@ -33,6 +33,7 @@ _MOST_DAMPING = 1e6
 _HOPE = 1.0  # that a fit gains in addition to twice what the curvature suggests
 _LARGEST_MOVE = 1.0  # of a delay in one step, in bins
 _PEAKS = 3  # highest peaks of the gain that are tried as delays of one more echo
+_ROUNDED_UP = 1.0 + 1e-12  # so that a bound holds in spite of rounding
 _SHARES = ((0.5, 0.5, 1.0), (0.3, 0.7, 1.5), (0.7, 0.3, 1.5))
 """Ways to split one echo in two: share of the first, of the second, distance in `apart_bins`."""
 
@@ -46,6 +47,8 @@ class EchoModel(NamedTuple):
     """Bins from a delay to the first tap."""
     background: NDArray[np.float64]
     """β, share of the background in each bin, shape (bin,)."""
+    is_uniform: bool
+    """Whether each bin has the same."""
     is_first: bool
     """Whether pulses fire once."""
     n_pulses: float
@@ -99,6 +102,39 @@ def _share(model, k, delay):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
+def _is_met(model, k, delay, n_echoes):  # type: ignore[no-untyped-def]
+    """Whether one of the first echoes adds photons to a bin."""
+    for j in range(n_echoes):
+        if 0 <= k - math.floor(delay[j]) - model.first_tap < model.echo.shape[1]:
+            return True
+    return False
+
+
+@njit(**COMPILED)
+def _add_bin(n, rate, is_first, change, gradient, curvature):  # type: ignore[no-untyped-def]
+    """Return what n detections add to ℓ; add to its gradient and curvature.
+
+    The rate of their bin, at least `_LEAST` of its background, changes by `change` (value,) with
+    the values.
+    """
+    rate = max(rate, _LEAST * change[0])
+    if is_first:
+        more = math.expm1(rate)
+        log = n * (math.log(more) - rate)
+        first_order, second_order = n / more, n * (more + 1.0) / (more * more)
+    else:
+        log = n * math.log(rate)
+        first_order, second_order = n / rate, n / (rate * rate)
+    for a in range(change.size):
+        if change[a] != 0.0:
+            gradient[a] += first_order * change[a]
+            weight = second_order * change[a]
+            for c in range(a + 1):
+                curvature[a, c] += weight * change[c]
+    return log
+
+
+@njit(**COMPILED)
 def _evaluate(pixel, model, values, n_echoes, gradient, curvature):  # type: ignore[no-untyped-def]
     """Return ℓ; fill its gradient (value,) and the negative curvature (value, value).
 
@@ -119,28 +155,31 @@ def _evaluate(pixel, model, values, n_echoes, gradient, curvature):  # type: ign
             log -= pixel.unfired[k] * signal * share
             gradient[1 + j] -= pixel.unfired[k] * share
             gradient[1 + n_echoes + j] -= pixel.unfired[k] * signal * slope
-    change = np.empty(n_values)
+    change = np.zeros(n_values)
+    n_alone = pixel.n_photons  # in bins that no echo meets
+    for j in range(n_echoes):
+        first = math.floor(values[1 + n_echoes + j]) + model.first_tap
+        for k in range(max(first, 0), min(first + n_taps, n_bins)):
+            if pixel.counts[k] > 0 and not _is_met(model, k, values[1 + n_echoes :], j):
+                n_alone -= pixel.counts[k]
+                rate = values[0] * model.background[k]
+                change[0] = model.background[k]
+                for i in range(n_echoes):
+                    share, slope = _share(model, k, values[1 + n_echoes + i])
+                    rate += values[1 + i] * share
+                    change[1 + i], change[1 + n_echoes + i] = share, values[1 + i] * slope
+                log += _add_bin(pixel.counts[k], rate, model.is_first, change, gradient, curvature)
+    for a in range(1, n_values):
+        change[a] = 0.0
+    if model.is_uniform:
+        change[0] = model.background[0]
+        rate = values[0] * change[0]
+        return log + _add_bin(n_alone, rate, model.is_first, change, gradient, curvature)
     for k in pixel.fired:
-        n, rate = pixel.counts[k], values[0] * model.background[k]
-        change[0] = model.background[k]
-        for j in range(n_echoes):
-            share, slope = _share(model, k, values[1 + n_echoes + j])
-            rate += values[1 + j] * share
-            change[1 + j], change[1 + n_echoes + j] = share, values[1 + j] * slope
-        rate = max(rate, _LEAST * model.background[k])
-        if model.is_first:
-            more = math.expm1(rate)
-            log += n * (math.log(more) - rate)
-            first_order, second_order = n / more, n * (more + 1.0) / (more * more)
-        else:
-            log += n * math.log(rate)
-            first_order, second_order = n / rate, n / (rate * rate)
-        for a in range(n_values):
-            if change[a] != 0.0:
-                gradient[a] += first_order * change[a]
-                weight = second_order * change[a]
-                for c in range(a + 1):
-                    curvature[a, c] += weight * change[c]
+        if not _is_met(model, k, values[1 + n_echoes :], n_echoes):
+            change[0] = model.background[k]
+            rate = values[0] * change[0]
+            log += _add_bin(pixel.counts[k], rate, model.is_first, change, gradient, curvature)
     return log
 
 
@@ -227,43 +266,63 @@ def _fit(pixel, model, values, n_echoes, needed):  # type: ignore[no-untyped-def
 
 
 @njit(**COMPILED)
-def _fill_gains(pixel, model, values, n_echoes, signal, gain):  # type: ignore[no-untyped-def]
-    """Fill the signal and the gain in ℓ of one more echo in the middle of each bin, (bin,) each.
+def _fill_most_gains(pixel, model, values, n_echoes, more, signal, most):  # type: ignore[no-untyped-def]
+    """Fill signal and upper bound of the gain of one more echo in the middle of each bin, (bin,).
 
-    The signal is the best linear unbiased estimate for the rates of the echoes so far. Their
-    background is not fitted again, which changes the gain in second order.
+    The signal is the best linear unbiased estimate for the rates μ of the echoes so far, of which
+    `more` (bin,) is set to ``exp(μ) - 1``, or to μ if all photons are counted. Their background is
+    not fitted again, which changes the gain in second order.
     """
     n_bins, n_taps = pixel.counts.size, model.echo.shape[1]
-    rate, residual, weight = np.empty(n_bins), np.empty(n_bins), np.empty(n_bins)
+    residual, weight = np.empty(n_bins), np.empty(n_bins)
     middle = (model.echo.shape[0] - 1) // 2
     for k in range(n_bins):
-        rate[k] = values[0] * model.background[k]
+        more[k] = values[0] * model.background[k]
     for j in range(n_echoes):
         first = math.floor(values[1 + n_echoes + j]) + model.first_tap
         for k in range(max(first, 0), min(first + n_taps, n_bins)):
-            rate[k] += values[1 + j] * _share(model, k, values[1 + n_echoes + j])[0]
+            more[k] += values[1 + j] * _share(model, k, values[1 + n_echoes + j])[0]
     for k in range(n_bins):
-        more = math.expm1(rate[k]) if model.is_first else rate[k]
-        residual[k] = pixel.counts[k] / more - pixel.unfired[k]
+        if model.is_first:
+            more[k] = math.expm1(more[k])
+        residual[k] = pixel.counts[k] / more[k] - pixel.unfired[k]
         armed = pixel.unfired[k] + (pixel.counts[k] if model.is_first else 0.0)
-        weight[k] = armed / more
+        weight[k] = armed / more[k]
     for d in range(n_bins):
-        first, score, known, lost = d + model.first_tap, 0.0, 0.0, 0.0
-        begin, end = max(first, 0), min(first + n_taps, n_bins)
-        for k in range(begin, end):
+        first, score, known = d + model.first_tap, 0.0, 0.0
+        for k in range(max(first, 0), min(first + n_taps, n_bins)):
             share = model.echo[middle, k - first]
             score += share * residual[k]
             known += share * share * weight[k]
-            lost += share * pixel.unfired[k]
-        signal[d], gain[d] = 0.0, 0.0
-        if score > 0.0 and known > 0.0:
-            signal[d] = score / known
-            gain[d] = -signal[d] * lost
-            for k in range(begin, end):
-                if pixel.counts[k] > 0:
-                    s, b = signal[d] * model.echo[middle, k - first], rate[k]
-                    odds = -math.expm1(-s) / math.expm1(b) if model.is_first else s / b
-                    gain[d] += pixel.counts[k] * math.log1p(odds)
+        there = score > 0.0 and known > 0.0
+        signal[d] = score / known if there else 0.0
+        most[d] = _ROUNDED_UP * signal[d] * score if there else 0.0
+
+
+@njit(**COMPILED)
+def _gain(pixel, model, d, signal, more):  # type: ignore[no-untyped-def]
+    """Return the gain in ℓ of one more echo in the middle of bin d, see `_fill_most_gains`.
+
+    At most what it is to first order in the signal, since ``ln(1 + x) <= x``.
+    """
+    middle, first, gain = (model.echo.shape[0] - 1) // 2, d + model.first_tap, 0.0
+    for k in range(max(first, 0), min(first + model.echo.shape[1], pixel.counts.size)):
+        photons = signal * model.echo[middle, k - first]
+        gain -= photons * pixel.unfired[k]
+        if pixel.counts[k] > 0:
+            added = -math.expm1(-photons) if model.is_first else photons
+            gain += pixel.counts[k] * math.log1p(added / more[k])
+    return gain
+
+
+@njit(**COMPILED)
+def _highest(pixel, model, signal, more, gain, is_exact):  # type: ignore[no-untyped-def]
+    """Return the bin of the highest gain; replace bounds that exceed it by gains, in place."""
+    d = _largest(gain)
+    while not is_exact[d]:
+        gain[d], is_exact[d] = _gain(pixel, model, d, signal[d], more), True
+        d = _largest(gain)
+    return d
 
 
 @njit(**COMPILED)
@@ -282,15 +341,16 @@ def _fill_starts(pixel, model, values, n_echoes, starts):  # type: ignore[no-unt
     One more echo at the highest peaks of the gain, or half of the strongest echo.
     """
     n_bins, half, n_starts = pixel.counts.size, math.ceil(model.apart_bins), 0
-    signal, gain = np.empty(n_bins), np.empty(n_bins)
-    _fill_gains(pixel, model, values, n_echoes, signal, gain)
+    signal, more, gain = np.empty(n_bins), np.empty(n_bins), np.empty(n_bins)
+    _fill_most_gains(pixel, model, values, n_echoes, more, signal, gain)
+    is_exact = gain <= 0.0
     for _ in range(_PEAKS if n_echoes > 0 else 1):
-        d = _largest(gain)
+        d = _highest(pixel, model, signal, more, gain, is_exact)
         if gain[d] <= 0.0:
             break
         _start(values, n_echoes, signal[d], d + 0.5, starts[n_starts])
         for k in range(max(d - half, 0), min(d + half + 1, n_bins)):
-            gain[k] = 0.0
+            gain[k], is_exact[k] = 0.0, True
         n_starts += 1
     if n_echoes == 0:
         return n_starts
