@@ -18,6 +18,8 @@ from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.tracking import PRESETS, tracking_signals
 
+_LARGE = 2**16
+
 
 def warm_up(
     progress: Callable[[int, int], None] = lambda done, of: None, only: str | None = None
@@ -42,8 +44,12 @@ def warm_up(
         scene = Scene(np.full((1, 1), 50.0), acquisition=acquisition)
         return simulate(scene, acquisition, Flux())
 
-    def estimated(method: str, returns: int = 1) -> RangeImage:
-        return estimate(small(), method, returns=returns)
+    @cache
+    def large() -> Capture:
+        return _with_large_counts(small())
+
+    def estimated(method: str, of: Callable[[], Capture] = small, returns: int = 1) -> RangeImage:
+        return estimate(of(), method, returns=returns)
 
     steps: list[Callable[[], object]] = [
         small,
@@ -54,16 +60,32 @@ def warm_up(
         lambda: pixel_report(small(), estimated(only or "tracking"), 0, 0),
     ]
     if only is None:
-        steps += [partial(estimated, "peak", 2), _use_neighbours, lambda: fit_of(small())]
+        steps += [
+            partial(estimated, "peak", returns=2),
+            _use_neighbours,
+            lambda: fit_of(small()),
+            *(partial(estimated, method, large) for method in ESTIMATORS),
+            partial(estimated, "peak", large, returns=2),
+            lambda: fit_of(large()),
+        ]
     progress(0, len(steps))
     for done, step in enumerate(steps, 1):
         step()
         progress(done, len(steps))
 
 
+def _with_large_counts(capture: Capture) -> Capture:
+    """Multiply the counts of first photons beyond uint16, for which other kernels are compiled."""
+    n_pulses = _LARGE * (capture.acquisition.n_pulses or 1)
+    acquisition = replace(capture.acquisition, n_pulses=n_pulses)
+    return replace(capture, cube=np.uint32(_LARGE) * capture.cube, acquisition=acquisition)
+
+
 def _use_neighbours() -> None:
     """Compile what the image posterior and velocities need where neighbours agree."""
     wall = scenes["wall"](16)
-    estimate(simulate(wall, wall.acquisition, Flux(sbr=1.0)), "image_posterior")
+    capture = simulate(wall, wall.acquisition, Flux(sbr=1.0))
+    for each in (capture, _with_large_counts(capture)):
+        estimate(each, "image_posterior")
     passing = replace(wall, motion=Motion(speed_m_per_s=20.0, pulse_rate_hz=20e3))
     estimate(simulate(passing, wall.acquisition, Flux(sbr=1.0), n_groups=8), "velocity")

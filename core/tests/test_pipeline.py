@@ -68,6 +68,7 @@ def test_nothing_is_left_to_compile_or_import_after_warming_up(only: str | None)
     script = f"""
 only = {only!r}
 import core, numba, sys
+import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 modules = [module for name, module in sys.modules.items() if name.startswith("core.")]
@@ -83,6 +84,10 @@ for method in [only] if only else core.ESTIMATORS:
 if only is None:
     flat = core.simulate(core.scenes["wall"](16), scene.acquisition, core.Flux(sbr=1.0))
     core.run(flat, "image_posterior")
+    # Counts beyond uint16.
+    bright = core.Capture(np.uint32(2**17) * flat.cube, scene.acquisition, detection="all")
+    for method in set(core.ESTIMATORS) - {{"oracle"}}:
+        core.run(bright, method)
 for settings in core.PRESETS.values():
     core.tracking_signals(capture.cube, settings)
     image = core.estimate(capture, "tracking", settings)
