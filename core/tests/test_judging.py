@@ -137,7 +137,8 @@ def test_the_command_line_takes_the_judge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    capture = Condition("piecewise", 0.03).capture(0)
+    scene = core.scenes["piecewise"](24)
+    capture = core.simulate(scene, scene.acquisition, core.Flux(0.1, sbr=0.1))
     expected = core.estimate(capture, "tracking", judged_by="image")
     core.save_capture(capture, "planes.npz")
     by_image = "--judged-by", "image"
