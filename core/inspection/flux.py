@@ -138,27 +138,33 @@ class _Pixel:
         # Bins that an echo at each bin covers, shape (tap, bin), with zeros beyond the gate.
         before, behind = max(-first, 0), max(first + n_taps - 1, 0)
         at = before + first + self._bins
-        self._met_counts, met_unfired = (
+        met_counts, met_unfired = (
             sliding_window_view(np.pad(each, (before, behind)), n_taps)[at].T
             for each in (self._counts, self._unfired)
         )
-        self._unfired_echo = self._echo @ met_unfired
-        self._best = np.full(self._bins.size, -np.inf)
+        unfired_echo = self._echo @ met_unfired
+        # Of adjacent bins that no count tells apart, one is computed.
+        is_counted, differs = np.asarray(met_counts.any(axis=0)), np.full(at.size, True)
+        differs[1:] = (np.diff(unfired_echo, axis=1) != 0).any(axis=0)
+        differs[1:] |= is_counted[1:] | is_counted[:-1]
+        self._group, some = np.cumsum(differs) - 1, np.flatnonzero(differs)
+        self._size = np.diff(some, append=self._bins.size).astype(float)
+        self._met_counts, self._unfired_echo = met_counts[:, some], unfired_echo[:, some]
+        self._best = np.full(some.size, -np.inf)
 
     def __call__(self, signal: Floats, background: Floats) -> Floats:
         """Log likelihood, of the shape of both arguments."""
         s, b = signal.ravel(), np.maximum(background.ravel(), _LEAST_BACKGROUND) / self._counts.size
         top, mean = np.empty((2, s.size))
         self._best[:] = -np.inf
-        at_once = max(1, _AT_ONCE // (len(self._echo) * self._bins.size))
+        at_once = max(1, _AT_ONCE // self._unfired_echo.size)
         for first in range(0, s.size, at_once):
             some = slice(first, first + at_once)
             ratio = self._ratio(s[some, np.newaxis, np.newaxis], b[some, np.newaxis, np.newaxis])
             np.maximum(self._best, ratio.max(axis=(0, 1)), out=self._best)
-            ratio = ratio.reshape(len(ratio), -1)
-            top[some] = ratio.max(axis=1)
-            ratio -= top[some, np.newaxis]
-            total = np.exp(ratio, out=ratio).sum(axis=1)
+            top[some] = ratio.max(axis=(1, 2))
+            ratio -= top[some, np.newaxis, np.newaxis]
+            total = np.exp(ratio, out=ratio).sum(axis=1) @ self._size
             mean[some] = total / (self._counts.size * len(self._echo))
         return np.asarray((self._flat(b) + top + np.log(mean)).reshape(signal.shape))
 
@@ -181,7 +187,7 @@ class _Pixel:
 
         Return whether any were excluded.
         """
-        likely = self._best >= self._best.max() - _NEGLIGIBLE
+        likely = (self._best >= self._best.max() - _NEGLIGIBLE)[self._group]
         self._bins = self._bins[likely]
         steps = _STEPS_CLOSE if self._bins.size <= _FEW_BINS else len(self._echo)
         self._take_steps(steps)

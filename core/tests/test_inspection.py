@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import logsumexp
 
 import core
 from core import inspection
@@ -94,6 +95,38 @@ def test_photons_of_unknown_pulses_are_counted() -> None:
         found = estimate_flux(counts, ACQUISITION, pulse, None)
         hits += [covers(each, value) for each, value in zip(found, (8, 12, 8 / 12), strict=True)]
     assert all(is_covered_often_enough(each, 100) for each in hits)
+
+
+@pytest.mark.parametrize("n_echo", [0, 15])
+@pytest.mark.parametrize("n_pulses", [None, 300])
+def test_fluxes_of_few_photons_in_a_long_gate_are_those_of_all_delays(
+    n_pulses: int | None, n_echo: int
+) -> None:
+    """Most bins meet no photon, and have no likelihood of their own."""
+    n_bins, pulse, rng = 300, Pulse(), np.random.default_rng(5)
+    acquisition = Acquisition(n_bins=n_bins, n_pulses=n_pulses)
+    counts = rng.multinomial(25, np.full(n_bins, 1 / n_bins)).astype(float)
+    counts += rng.multinomial(n_echo, pulse.bin_probability(222.4, n_bins, 1e-9))
+    found = estimate_flux(counts, acquisition, pulse, n_pulses)
+    delays = (np.arange(2 * n_bins) + 0.5) / 2
+    echo = pulse.bin_probability(delays, n_bins, 1e-9)
+    unfired = np.ones(n_bins) if n_pulses is None else n_pulses - np.cumsum(counts)
+
+    def log_likelihood(signal: float, background: float) -> float:
+        rate = background / n_bins + signal * echo
+        fires = rate if n_pulses is None else -np.expm1(-rate)
+        return float(logsumexp(np.log(fires) @ counts - rate @ unfired))
+
+    most = log_likelihood(found.signal.value, found.background.value)
+    for factors in product((0.95, 1.0, 1.05), repeat=2):
+        there = (each.value * by for each, by in zip(found, factors, strict=False))
+        assert log_likelihood(*there) <= most + 1e-3
+    assert (found.signal.low > 0) == (n_echo > 0)
+    for end in {found.signal.low, found.signal.high} - {0.0}:
+        near = found.background.value * np.linspace(0.6, 1.4, 81)
+        assert max(log_likelihood(end, each) for each in near) == pytest.approx(
+            most - 1.92, abs=0.1
+        )
 
 
 def test_more_pixels_narrow_the_interval() -> None:
