@@ -98,6 +98,20 @@ def test_no_two_echoes_are_likelier_than_those_fitted(detection: str) -> None:
         assert found >= -best.fun - 0.1
 
 
+@pytest.mark.parametrize("detection", ["first", "all"])
+def test_bins_without_echoes_are_added_up_at_once_or_one_by_one(detection: str) -> None:
+    capture, _ = two_surfaces(8.0, 0.5, 0.5, 3)
+    capture = counted(capture, 30.0, 40.0) if detection == "all" else capture
+    uniform = np.full(100, 0.01)
+    alike, one_by_one = (
+        fitted_echoes(capture, capture.cube, 2, 0.0, uniform * (1 + differing))
+        for differing in (0.0, 1e-12 * np.arange(100))
+    )
+    np.testing.assert_array_equal(alike.number, one_by_one.number)
+    for found, other in zip(alike[:4], one_by_one[:4], strict=True):
+        np.testing.assert_allclose(found, other, rtol=1e-6)
+
+
 @compiled
 @pytest.mark.parametrize(
     ("separation", "share", "sbr", "least"),
