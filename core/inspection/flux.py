@@ -143,7 +143,7 @@ class _Pixel:
             for each in (self._counts, self._unfired)
         )
         unfired_echo = self._echo @ met_unfired
-        # Of adjacent bins that no count tells apart, one is computed.
+        # Adjacent bins without counts and with as many unfired pulses are equally likely.
         is_counted, differs = np.asarray(met_counts.any(axis=0)), np.full(at.size, True)
         differs[1:] = (np.diff(unfired_echo, axis=1) != 0).any(axis=0)
         differs[1:] |= is_counted[1:] | is_counted[:-1]
