@@ -15,8 +15,8 @@ the same along the columns: sum-product messages (`core.kernels.messages`), in w
 pixel counts once. The same with columns first; the posterior is the mean of both.
 
 **Planes.** Where the surface is oblique or slopes, its pixels do not share a delay but a plane. A
-plane is fitted around each pixel, robust to other surfaces (`core.kernels.planes`), and the
-messages are repeated along it with a narrower kernel, starting again from the evidence, twice.
+plane is found for each pixel, robust to other surfaces (`core.kernels.planes`), and the messages
+are repeated along it with a narrower kernel, starting again from the evidence, three times.
 
 If pairs of neighbours agree no more than pairs at random, each pixel is estimated by itself, by the
 likelihood with the depths of the image as their prior.
@@ -53,15 +53,15 @@ from core.inference.posterior import States, mass_near, tolerance_probability
 from core.kernels.blocks import LANES
 from core.kernels.messages import fill_modes, fill_posterior
 from core.kernels.parallel import on_threads
-from core.kernels.planes import fill_planes
+from core.kernels.planes import fill_planes, fill_window_planes
 from core.parameters import Number, Settings, parameter
 
-_ROUNDS = 3
+_ROUNDS = 4
 _LEAST_ODDS = 1e-12
 _EMPTY_SHARE = 0.01  # of pixels without an echo, if every pixel is estimated
 _UNLIKELY = 0.1  # probability of a surface below which its signal level is unknown
 _FALSE_PIXELS = 0.5  # of an image, that may get a range whatever the share of empty ones
-_ALONG_PLANES = 0.8, 0.15  # ρ and the scale of K in bins
+_ALONG_PLANES = 0.8, 0.25  # ρ and the scale of K in bins
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
 
@@ -205,16 +205,21 @@ def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:
 
 
 def planes(delay: Floats, weight: Floats) -> NDArray[np.float32]:
-    """Fit a plane around each pixel: delay, change per row and change per column (3, row, col)."""
-    (rows, cols), margin = delay.shape, (_HALF, _HALF)
+    """Find the plane of each pixel: delay, change per row and change per column (3, row, col)."""
+    (rows, cols), margin, work = delay.shape, (_HALF, _HALF), delay.size * (2 * _HALF + 1) ** 2
     beyond = -cols % LANES
-    wide = [
-        np.pad(each.astype(np.float32), (margin, (_HALF, _HALF + beyond)))
-        for each in (delay, weight)
-    ]
-    plane = np.empty((3, rows, cols + beyond), np.float32)
-    on_threads(fill_planes, rows, delay.size * (2 * _HALF + 1) ** 2, *wide, _HALF, plane)
-    return plane[:, :, :cols]
+
+    def wide(image: Floats | NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.pad(image[:, :cols].astype(np.float32), (margin, (_HALF, _HALF + beyond)))
+
+    here = np.empty((3, rows, cols + beyond), np.float32)
+    support = np.empty(here.shape[1:], np.float32)
+    seen = wide(delay)
+    on_threads(fill_window_planes, rows, work, seen, wide(weight), _HALF, here, support)
+    windows = np.stack([wide(each) for each in here])
+    own = np.ascontiguousarray(seen[_HALF : _HALF + rows, _HALF : _HALF + cols + beyond])
+    on_threads(fill_planes, rows, work, own, windows, wide(support), _HALF, here)
+    return here[:, :, :cols]
 
 
 def _locate(

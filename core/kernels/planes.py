@@ -1,4 +1,10 @@
-"""Kernel that fits a plane to the neighbourhood of each pixel, robust to other surfaces."""
+"""Kernels that find the plane of each pixel from its neighbours, robust to other surfaces.
+
+A plane is fitted to the window around each pixel. Where that window has several surfaces, another
+one that contains the pixel may lie on its surface alone: each pixel takes the plane of the window
+that suits it best (shiftable windows; Bobick & Intille 1999, "Large occlusion stereo"), of near
+ones rather than of distant ones, since surfaces are curved.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +17,25 @@ from core.kernels.parallel import COMPILED
 SPREADS_BINS = (4.0, 3.0, 2.0, 1.5)
 """Distances from the plane at which the weight of a pixel is a quarter, one per round."""
 
+_OWN_SPREAD_BINS = 1.5
+"""Distance of a pixel from the plane of a window at which the plane suits it a quarter as well."""
+
+_PER_OWN_SQUARE = np.float32(1 / _OWN_SPREAD_BINS**2)
+
+_NEAR_PIXELS = 3.0
+"""Standard deviation of the Gaussian of the distance to the middle of the window."""
+
 _RIDGE = np.float32(1e-3)  # pulls a slope that no neighbour determines towards 0
-_N_SUMS = 9
+_N_SUMS = 10
+_LEAST_WEIGHT = np.float32(1e-9)
+_WIDE = 2  # times LANES: pixels in a row, and the windows on either side that contain them
 
 
 @njit(**COMPILED)
 def _add(delay, weight, y, x, per_square, plane, sums):  # type: ignore[no-untyped-def]
     """Add neighbours (lane,), y rows below and x columns right of the pixels, to the sums.
 
-    `plane` is of shape (3 * LANES,), `sums` of shape (9 * LANES,).
+    `plane` is of shape (3 * LANES,), `sums` of shape (10 * LANES,).
     """
     for i in range(LANES):
         z = delay[i] - (plane[i] + plane[LANES + i] * y + plane[2 * LANES + i] * x)
@@ -34,6 +50,7 @@ def _add(delay, weight, y, x, per_square, plane, sums):  # type: ignore[no-untyp
         sums[6 * LANES + i] += w * z
         sums[7 * LANES + i] += w * y * z
         sums[8 * LANES + i] += w * x * z
+        sums[9 * LANES + i] += weight[i]
 
 
 @njit(**COMPILED)
@@ -55,8 +72,13 @@ def _solve(sums, plane):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def fill_planes(first_row, end_row, delay, weight, half, plane):  # type: ignore[no-untyped-def]
-    """Fill `plane` (3, row, col): delay in the pixel, and its change from row to row, col to col.
+def fill_window_planes(  # type: ignore[no-untyped-def]
+    first_row, end_row, delay, weight, half, plane, support
+):
+    """Fit a plane to the window around each pixel.
+
+    Fills `plane` (3, row, col): delay in the pixel, and its change from row to row, col to col, and
+    `support` (row, col): the share of the weight of the window on the plane.
 
     Weighted least squares over 2 half + 1 rows and columns. The weights are those given times
     ``1 / (1 + (r / s)²)²`` with the distance r from the plane of the round before, at first a level
@@ -82,3 +104,68 @@ def fill_planes(first_row, end_row, delay, weight, half, plane):  # type: ignore
                 _solve(sums, here)
             for k in range(3):
                 plane[k, row, first : first + LANES] = here[k * LANES : (k + 1) * LANES]
+            for i in range(LANES):
+                whole = max(sums[9 * LANES + i], _LEAST_WEIGHT)
+                support[row, first + i] = sums[i] / whole
+
+
+@njit(**COMPILED)
+def fill_planes(  # type: ignore[no-untyped-def]
+    first_row, end_row, delay, window_plane, support, half, plane
+):
+    """Fill `plane` with the best of the planes of all windows that contain the pixel.
+
+    That is the one with the largest support times ``1 / (1 + (r / s)²)²``, with the distance r of
+    the pixel's own delay, times a Gaussian of the distance to the middle of the window.
+
+    Parameters
+    ----------
+    first_row, end_row : int
+    delay : ndarray, shape (row, col)
+    window_plane : ndarray, shape (3, half + row + half, half + col + half)
+        As filled by `fill_window_planes`, with a margin.
+    support : ndarray, shape (half + row + half, half + col + half)
+        Likewise; 0 in the margin.
+    half : int
+    plane : ndarray, shape (3, row, col)
+        `col` is a multiple of LANES. All are float32.
+    """
+    cols, n, reach = plane.shape[2], 2 * half + 1, LANES + 2 * half
+    near = np.exp(-0.5 * (np.arange(-half, half + 1) / _NEAR_PIXELS) ** 2).astype(np.float32)
+    for row in range(first_row, end_row):
+        windows, best = lane_rows(4 * _WIDE), lane_rows(5)
+        for first in range(0, cols, LANES):
+            best[:LANES] = 0.0
+            best[LANES : 2 * LANES] = best[4 * LANES :] = delay[row, first : first + LANES]
+            best[2 * LANES : 4 * LANES] = 0.0
+            for i in range(n):
+                for k in range(4):
+                    from_row = support[row + i] if k == 0 else window_plane[k - 1, row + i]
+                    to = k * _WIDE * LANES
+                    windows[to : to + reach] = from_row[first : first + reach]
+                y = np.float32(half - i)
+                for j in range(n):
+                    _take_better(windows[j:], y, np.float32(half - j), near[i] * near[j], best)
+            for k in range(3):
+                plane[k, row, first : first + LANES] = best[(k + 1) * LANES : (k + 2) * LANES]
+
+
+@njit(**COMPILED)
+def _take_better(windows, y, x, near, best):  # type: ignore[no-untyped-def]
+    """Replace the `best` planes of pixels by those of windows that suit them better.
+
+    The pixels lie y rows below and x columns right of the middles of the windows. `windows` has
+    rows of `_WIDE` * LANES: support, delay, and changes per row and per column. `best` has rows of
+    LANES: how well the plane suits, the plane likewise, and the delay of the pixel.
+    """
+    for i in range(LANES):
+        down, right = windows[2 * _WIDE * LANES + i], windows[3 * _WIDE * LANES + i]
+        at = windows[_WIDE * LANES + i] + down * y + right * x
+        z = best[4 * LANES + i] - at
+        ratio = np.float32(1.0) / (np.float32(1.0) + z * z * _PER_OWN_SQUARE)
+        suits = near * windows[i] * ratio * ratio
+        is_better = suits > best[i]
+        best[i] = suits if is_better else best[i]
+        best[LANES + i] = at if is_better else best[LANES + i]
+        best[2 * LANES + i] = down if is_better else best[2 * LANES + i]
+        best[3 * LANES + i] = right if is_better else best[3 * LANES + i]
