@@ -27,9 +27,8 @@ from core.estimators.image_model import (
     image_model_of,
     merged_bins,
     merged_flux,
-    states_of_image,
 )
-from core.estimators.image_posterior import peaks, planes, solved
+from core.estimators.image_posterior import image_posterior_of, peaks, slopes_of, solved
 from core.inference.flux_model import Agreement
 from core.inference.posterior import TOLERANCE_BINS, States
 from core.inference.returns import FALSE_RETURN, echo_model, pixel_counts
@@ -93,22 +92,23 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
     flux = image_model_of(capture)
     if flux.agreement.alike == 0:
         return None
+    alone = image_posterior_of(capture, flux)
     merged, factor = merged_bins(capture)
     flux = merged_flux(flux, factor)
     shape, prior = merged.shape, Prior.of(flux)
     image = _Image(pixel_counts(merged.cube), echo_model(merged), shape, prior, flux.agreement)
-    first = solved(states_of_image(merged, flux), prior, flux.agreement)
+    first = alone.by_bin.copy()
     delay, slopes = np.zeros((2, *shape)), list[NDArray[np.float32] | None]([None, None])
-    delay[0], weight = peaks(first.surface)
-    slopes[0] = _slopes(delay[0], weight)
-    present = np.stack([first.nothing < _LIKELY, np.zeros(shape, bool)])
-    signal = np.stack([flux.typical_signal.ravel(), np.zeros(first.nothing.size)])
+    delay[0], weight = peaks(first)
+    slopes[0] = slopes_of(delay[0], weight)
+    present = np.stack([alone.surface > 1 - _LIKELY, np.zeros(shape, bool)])
+    signal = np.stack([flux.typical_signal.ravel(), np.zeros(delay[0].size)])
     fluxes = _local(image, _Fluxes(flux.typical_background.ravel(), signal), delay, present)
-    second, share = first, _FIRST_SHARE
+    share = _FIRST_SHARE
     for number in range(_ROUNDS):
         second = _second_layer(image, fluxes, delay[0], present[0], share, slopes[1])
         delay[1], weight = peaks(second.surface)
-        slopes[1] = _slopes(delay[1], weight)
+        slopes[1] = slopes_of(delay[1], weight)
         share = float(np.clip(1 - second.nothing[present[0]].mean(), _LEAST_SHARE, _MOST_SHARE))
         present[1] = present[0] & (second.nothing < _LIKELY) & _apart(delay)
         if not present[1].any():
@@ -121,23 +121,19 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
         again = solved(evidence, prior, flux.agreement, slopes[0])
         found, weight = peaks(again.surface)
         delay[0] = np.where(present[1], found, delay[0])
-        first.surface[present[1]] = again.surface[present[1]]
-        slopes[0] = _slopes(delay[0], weight)
+        first[present[1]] = again.surface[present[1]]
+        slopes[0] = slopes_of(delay[0], weight)
     if present[1].any():
         least = _nothing_of_one_surface(capture, image, fluxes, delay[0], present[0], share)
         most = min(_LIKELY, float(np.quantile(least[present[0]], false_return)))
         present[1] &= (second.nothing < most) & _apart(delay)
-    confidence = np.stack([_mass(first.surface, delay[0]), _mass(second.surface, delay[1])])
+    confidence = np.stack([_mass(first, delay[0]), _mass(second.surface, delay[1])])
     delay[1, ~present[1]] = np.nan
     return Layers(delay * factor, fluxes.signal.reshape(2, *shape), confidence)
 
 
 def _apart(delay: Floats) -> NDArray[np.bool_]:
     return np.asarray(np.abs(delay[1] - delay[0]) >= _LEAST_DISTANCE_BINS)
-
-
-def _slopes(delay: Floats, weight: Floats) -> NDArray[np.float32]:
-    return np.ascontiguousarray(planes(delay, weight)[1:])
 
 
 def _second_layer(

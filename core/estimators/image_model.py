@@ -32,7 +32,12 @@ from numpy.typing import NDArray
 
 from core.acquisition import MOST_PULSES, Floats
 from core.capture import Capture, cached_per_capture
-from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_model_with
+from core.inference.flux import (
+    detailed_flux_prior_of,
+    detailed_flux_prior_over,
+    flux_model_of,
+    flux_model_with,
+)
 from core.inference.flux_model import UNRELATED, Agreement, FluxModel, FluxPrior
 from core.inference.likelihood import prepare, prepared_groups
 from core.inference.posterior import States, states_of
@@ -132,14 +137,14 @@ def _flux_priors(capture: Capture) -> Iterator[tuple[FluxPrior, Capture | None]]
         if tiles < FEWEST_PIXELS or not fits:
             return
         pooled = pool_pixels(capture, side)
-        prior = detailed_flux_prior_of(pooled)
+        prior = detailed_flux_prior_over(pooled, own.background_shape)
         each = 1 if is_first else side**2  # counts of a pixel, or photons per pulse
         per_pixel = prior._replace(
             levels=prior.levels / each,
             background=prior.background / each,
             own_weight=own.own_weight,
         )
-        yield per_pixel, pooled
+        yield per_pixel, replace(pooled, flux_prior=prior)
 
 
 def _agreement(capture: Capture, flux: FluxModel) -> Agreement:

@@ -120,11 +120,20 @@ class ImagePosterior(NamedTuple):
     """Probability of a surface anywhere in the gate, shape (row, col)."""
 
 
+class _Filled(NamedTuple):
+    """Surfaces of an image in which nearly every pixel has one, in merged bins."""
+
+    delay: Floats
+    """Shape (row, col)."""
+    slopes: NDArray[np.float32]
+    """Per row and per column, shape (2, row, col)."""
+
+
 @cached_per_capture
 def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
     """Compute the posterior of an image with the flux model of `image_model_of`."""
     merged, factor = merged_bins(capture)
-    posterior = _posterior(merged, merged_flux(flux, factor))
+    posterior = _posterior(merged, merged_flux(flux, factor), _filled(capture, flux).slopes)
     delay, _ = peaks(posterior.surface)
     surface = 1.0 - posterior.nothing.astype(float)
     return ImagePosterior(delay * factor, posterior.surface, factor, surface)
@@ -137,22 +146,31 @@ def likeliest_delays(capture: Capture, flux: FluxModel) -> Floats:
     Where a surface of the levels of the image is unlikely, its level is unknown.
     """
     merged, factor = merged_bins(capture)
+    found, slopes = _filled(capture, flux)
+    is_faint = image_posterior_of(capture, flux).surface < _UNLIKELY
+    if is_faint.any():
+        flux = merged_flux(with_any_level(capture, flux, _EMPTY_SHARE), factor)
+        delay, _ = peaks(_posterior(merged, flux, slopes).surface)
+        found = np.where(is_faint, delay, found)
+    return found * factor
 
-    def delays(chosen: FluxModel) -> Floats:
-        return peaks(_posterior(merged, merged_flux(chosen, factor)).surface)[0] * factor
 
+@cached_per_capture
+def _filled(capture: Capture, flux: FluxModel) -> _Filled:
+    """Find the surfaces of an image as if nearly every pixel had one."""
+    merged, factor = merged_bins(capture)
     dark = _EMPTY_SHARE
     share = np.append(dark, (1 - dark) * flux.share[1:] / (flux.share[1:].sum() or 1.0))
-    found = delays(replace(flux, share=share))
-    is_faint = image_posterior_of(capture, flux).surface < _UNLIKELY
-    if not is_faint.any():
-        return found
-    return np.where(is_faint, delays(with_any_level(capture, flux, dark)), found)
+    posterior = _posterior(merged, merged_flux(replace(flux, share=share), factor))
+    delay, weight = peaks(posterior.surface)
+    return _Filled(delay, slopes_of(delay, weight))
 
 
-def _posterior(capture: Capture, flux: FluxModel) -> States:
-    """Compute the posterior of each pixel, given the whole image."""
-    return solved(states_of_image(capture, flux), Prior.of(flux), flux.agreement)
+def _posterior(
+    capture: Capture, flux: FluxModel, slopes: NDArray[np.float32] | None = None
+) -> States:
+    """Compute the posterior of each pixel, given the whole image; see `solved`."""
+    return solved(states_of_image(capture, flux), Prior.of(flux), flux.agreement, slopes)
 
 
 def solved(
@@ -183,7 +201,7 @@ def solved(
         for one, another in zip(both, other, strict=True):
             np.multiply(np.add(one, another, out=one), np.float32(0.5), out=one)
         if k < _ROUNDS - 1:
-            _, per_row, per_col = np.ascontiguousarray(planes(*peaks(both.surface)))
+            per_row, per_col = slopes_of(*peaks(both.surface))
     return both
 
 
@@ -202,6 +220,11 @@ def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:
     given = posterior.reshape(-1, posterior.shape[2]), delay.ravel(), weight.ravel()
     on_threads(fill_modes, delay.size, posterior.size, *given)
     return delay, weight
+
+
+def slopes_of(delay: Floats, weight: Floats) -> NDArray[np.float32]:
+    """Find the slopes of each pixel from row to row and from column to column, (2, row, col)."""
+    return np.ascontiguousarray(planes(delay, weight)[1:])
 
 
 def planes(delay: Floats, weight: Floats) -> NDArray[np.float32]:

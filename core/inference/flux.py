@@ -89,7 +89,12 @@ def flux_prior_of(capture: Capture) -> FluxPrior:
 
 def flux_prior_over(capture: Capture, background_shape: Floats | None) -> FluxPrior:
     """Estimate `flux_prior_of` over a background of known shape, uniform if None."""
-    return _simplified(_flux_prior(capture, background_shape)[0], capture)
+    return _simplified(detailed_flux_prior_over(capture, background_shape), capture)
+
+
+def detailed_flux_prior_over(capture: Capture, background_shape: Floats | None) -> FluxPrior:
+    """Estimate `detailed_flux_prior_of` over a background of known shape, uniform if None."""
+    return _flux_prior(capture, background_shape)[0]
 
 
 def _simplified(found: FluxPrior, capture: Capture) -> FluxPrior:
