@@ -16,7 +16,9 @@ pixel counts once. The same with columns first; the posterior is the mean of bot
 
 **Planes.** Where the surface is oblique or slopes, its pixels do not share a delay but a plane. A
 plane is found for each pixel, robust to other surfaces (`core.kernels.planes`), and the messages
-are repeated along it with a narrower kernel, starting again from the evidence, three times.
+are repeated along it with a narrower kernel, starting again from the evidence, three times. The
+planes are found as if nearly every pixel had a surface; with the shares of the levels as they are,
+messages pass along the same planes.
 
 If pairs of neighbours agree no more than pairs at random, each pixel is estimated by itself, by the
 likelihood with the depths of the image as their prior.
@@ -61,7 +63,7 @@ _LEAST_ODDS = 1e-12
 _EMPTY_SHARE = 0.01  # of pixels without an echo, if every pixel is estimated
 _UNLIKELY = 0.1  # probability of a surface below which its signal level is unknown
 _FALSE_PIXELS = 0.5  # of an image, that may get a range whatever the share of empty ones
-_ALONG_PLANES = 0.8, 0.25  # ρ and the scale of K in bins
+_ALONG_PLANES = 0.8, 0.2  # ρ and the scale of K in bins
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
 
