@@ -69,21 +69,22 @@ class _Found(NamedTuple):
 @cached_per_capture
 def image_model_of(capture: Capture) -> FluxModel:
     """Estimate flux and smoothness of a capture from its pixels and their neighbours."""
-    alone, merged, factor = flux_model_of(capture), *merged_bins(capture)
-    found, of_tiles = _Found(UNRELATED, alone), _Found(UNRELATED, alone)
+    merged, factor = merged_bins(capture)
+    found = of_tiles = _Found(UNRELATED, flux_model_of(capture))
     for prior, tiles in _flux_priors(capture):
         flux = flux_model_with(capture, prior)
         here = _agreement(merged, merged_flux(flux, factor))
-        if here.gain > found.agreement.gain:
-            found = _Found(here, flux)
-        if tiles is None or found.agreement.alike > 0:
-            continue
-        here = _agreement(merged_bins(tiles)[0], merged_flux(flux_model_of(tiles), factor))
-        if here.gain > of_tiles.agreement.gain:
-            of_tiles = _Found(here, flux)
+        found = max(found, _Found(here, flux), key=_gain)
+        if tiles is not None and found.agreement.alike == 0:
+            here = _agreement(merged_bins(tiles)[0], merged_flux(flux_model_of(tiles), factor))
+            of_tiles = max(of_tiles, _Found(here, flux), key=_gain)
     best, flux = of_tiles if found.agreement.alike == 0 else found
     depth = tempered(flux.depth) if best.alike > 0 else flux.depth
     return replace(flux, depth=depth, agreement=best)
+
+
+def _gain(found: _Found) -> float:
+    return found.agreement.gain
 
 
 def tempered(depth: Floats) -> Floats:

@@ -51,6 +51,7 @@ from core.estimators.image_model import (
 from core.estimators.likelihood import Depths, LikelihoodParameters, curve
 from core.estimators.likelihood import locate as locate_alone
 from core.inference.flux_model import Agreement, FluxModel
+from core.inference.neighbours import box_sum
 from core.inference.posterior import States, mass_near, tolerance_probability
 from core.kernels.blocks import LANES
 from core.kernels.messages import fill_modes, fill_posterior
@@ -64,6 +65,7 @@ _EMPTY_SHARE = 0.01  # of pixels without an echo, if every pixel is estimated
 _UNLIKELY = 0.1  # probability of a surface below which its signal level is unknown
 _FALSE_PIXELS = 0.5  # of an image, that may get a range whatever the share of empty ones
 _ALONG_PLANES = 0.8, 0.2  # ρ and the scale of K in bins
+_LEAST_WEIGHT = 1e-9  # of a window; 0 would have no share on a plane
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
 
@@ -120,6 +122,8 @@ class ImagePosterior(NamedTuple):
     """Bins in a merged one."""
     surface: Floats
     """Probability of a surface anywhere in the gate, shape (row, col)."""
+    slopes: NDArray[np.float32]
+    """Slopes along which messages passed, in merged bins: per row and per column, (2, row, col)."""
 
 
 class _Filled(NamedTuple):
@@ -128,17 +132,17 @@ class _Filled(NamedTuple):
     delay: Floats
     """Shape (row, col)."""
     slopes: NDArray[np.float32]
-    """Per row and per column, shape (2, row, col)."""
+    """As `ImagePosterior.slopes`."""
 
 
 @cached_per_capture
 def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
     """Compute the posterior of an image with the flux model of `image_model_of`."""
-    merged, factor = merged_bins(capture)
-    posterior = _posterior(merged, merged_flux(flux, factor), _filled(capture, flux).slopes)
+    (merged, factor), slopes = merged_bins(capture), _filled(capture, flux).slopes
+    posterior = _posterior(merged, merged_flux(flux, factor), slopes)
     delay, _ = peaks(posterior.surface)
     surface = 1.0 - posterior.nothing.astype(float)
-    return ImagePosterior(delay * factor, posterior.surface, factor, surface)
+    return ImagePosterior(delay * factor, posterior.surface, factor, surface, slopes)
 
 
 @cached_per_capture
@@ -161,8 +165,8 @@ def likeliest_delays(capture: Capture, flux: FluxModel) -> Floats:
 def _filled(capture: Capture, flux: FluxModel) -> _Filled:
     """Find the surfaces of an image as if nearly every pixel had one."""
     merged, factor = merged_bins(capture)
-    dark = _EMPTY_SHARE
-    share = np.append(dark, (1 - dark) * flux.share[1:] / (flux.share[1:].sum() or 1.0))
+    surfaces = (1 - _EMPTY_SHARE) * flux.share[1:] / (flux.share[1:].sum() or 1.0)
+    share = np.append(_EMPTY_SHARE, surfaces)
     posterior = _posterior(merged, merged_flux(replace(flux, share=share), factor))
     delay, weight = peaks(posterior.surface)
     return _Filled(delay, slopes_of(delay, weight))
@@ -231,20 +235,19 @@ def slopes_of(delay: Floats, weight: Floats) -> NDArray[np.float32]:
 
 def planes(delay: Floats, weight: Floats) -> NDArray[np.float32]:
     """Find the plane of each pixel: delay, change per row and change per column (3, row, col)."""
-    (rows, cols), margin, work = delay.shape, (_HALF, _HALF), delay.size * (2 * _HALF + 1) ** 2
-    beyond = -cols % LANES
+    (rows, cols), size = delay.shape, 2 * _HALF + 1
+    beyond, work = -cols % LANES, delay.size * size**2
 
     def wide(image: Floats | NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.pad(image[:, :cols].astype(np.float32), (margin, (_HALF, _HALF + beyond)))
+        inner, around = image[..., :cols].astype(np.float32), [(0, 0)] * (image.ndim - 2)
+        return np.pad(inner, (*around, (_HALF, _HALF), (_HALF, _HALF + beyond)))
 
-    here = np.empty((3, rows, cols + beyond), np.float32)
-    support = np.empty(here.shape[1:], np.float32)
-    seen = wide(delay)
-    on_threads(fill_window_planes, rows, work, seen, wide(weight), _HALF, here, support)
-    windows = np.stack([wide(each) for each in here])
-    own = np.ascontiguousarray(seen[_HALF : _HALF + rows, _HALF : _HALF + cols + beyond])
-    on_threads(fill_planes, rows, work, own, windows, wide(support), _HALF, here)
-    return here[:, :, :cols]
+    seen, windows = wide(delay), np.empty((4, rows, cols + beyond), np.float32)
+    on_threads(fill_window_planes, rows, work, seen, wide(weight), _HALF, windows)
+    windows[0, :, :cols] /= np.maximum(box_sum(weight, size, "constant"), _LEAST_WEIGHT)
+    plane = np.empty((3, rows, cols + beyond), np.float32)
+    on_threads(fill_planes, rows, work, seen, wide(windows), _HALF, plane)
+    return plane[..., :cols]
 
 
 def _locate(

@@ -17,17 +17,16 @@ from core.kernels.parallel import COMPILED
 SPREADS_BINS = (4.0, 3.0, 2.0, 1.5)
 """Distances from the plane at which the weight of a pixel is a quarter, one per round."""
 
-_OWN_SPREAD_BINS = 1.5
+OWN_SPREAD_BINS = 1.5
 """Distance of a pixel from the plane of a window at which the plane suits it a quarter as well."""
 
-_PER_OWN_SQUARE = np.float32(1 / _OWN_SPREAD_BINS**2)
+_PER_OWN_SQUARE = np.float32(1 / OWN_SPREAD_BINS**2)
 
-_NEAR_PIXELS = 3.0
+NEAR_PIXELS = 3.0
 """Standard deviation of the Gaussian of the distance to the middle of the window."""
 
 _RIDGE = np.float32(1e-3)  # pulls a slope that no neighbour determines towards 0
-_N_SUMS = 10
-_LEAST_WEIGHT = np.float32(1e-9)
+_N_SUMS = 9
 _WIDE = 2  # times LANES: pixels in a row, and the windows on either side that contain them
 
 
@@ -35,7 +34,7 @@ _WIDE = 2  # times LANES: pixels in a row, and the windows on either side that c
 def _add(delay, weight, y, x, per_square, plane, sums):  # type: ignore[no-untyped-def]
     """Add neighbours (lane,), y rows below and x columns right of the pixels, to the sums.
 
-    `plane` is of shape (3 * LANES,), `sums` of shape (10 * LANES,).
+    `plane` is of shape (3 * LANES,), `sums` of shape (9 * LANES,).
     """
     for i in range(LANES):
         z = delay[i] - (plane[i] + plane[LANES + i] * y + plane[2 * LANES + i] * x)
@@ -50,7 +49,6 @@ def _add(delay, weight, y, x, per_square, plane, sums):  # type: ignore[no-untyp
         sums[6 * LANES + i] += w * z
         sums[7 * LANES + i] += w * y * z
         sums[8 * LANES + i] += w * x * z
-        sums[9 * LANES + i] += weight[i]
 
 
 @njit(**COMPILED)
@@ -72,20 +70,18 @@ def _solve(sums, plane):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def fill_window_planes(  # type: ignore[no-untyped-def]
-    first_row, end_row, delay, weight, half, plane, support
-):
+def fill_window_planes(first_row, end_row, delay, weight, half, windows):  # type: ignore[no-untyped-def]
     """Fit a plane to the window around each pixel.
 
-    Fills `plane` (3, row, col): delay in the pixel, and its change from row to row, col to col, and
-    `support` (row, col): the share of the weight of the window on the plane.
+    Fills `windows` (4, row, col): the weight on the plane, the delay in the pixel, and its change
+    from row to row and from col to col.
 
     Weighted least squares over 2 half + 1 rows and columns. The weights are those given times
     ``1 / (1 + (r / s)²)²`` with the distance r from the plane of the round before, at first a level
     one. `delay` and `weight` are float32 with a margin of `half` pixels, whose weight is 0; `col`
     is a multiple of LANES.
     """
-    cols = plane.shape[2]
+    cols = windows.shape[2]
     for row in range(first_row, end_row):
         here, sums = lane_rows(3), lane_rows(_N_SUMS)
         for first in range(0, cols, LANES):
@@ -102,17 +98,13 @@ def fill_window_planes(  # type: ignore[no-untyped-def]
                             delay[row + i, met], weight[row + i, met], y, x, per_square, here, sums
                         )
                 _solve(sums, here)
+            windows[0, row, first : first + LANES] = sums[:LANES]
             for k in range(3):
-                plane[k, row, first : first + LANES] = here[k * LANES : (k + 1) * LANES]
-            for i in range(LANES):
-                whole = max(sums[9 * LANES + i], _LEAST_WEIGHT)
-                support[row, first + i] = sums[i] / whole
+                windows[k + 1, row, first : first + LANES] = here[k * LANES : (k + 1) * LANES]
 
 
 @njit(**COMPILED)
-def fill_planes(  # type: ignore[no-untyped-def]
-    first_row, end_row, delay, window_plane, support, half, plane
-):
+def fill_planes(first_row, end_row, delay, windows, half, plane):  # type: ignore[no-untyped-def]
     """Fill `plane` with the best of the planes of all windows that contain the pixel.
 
     That is the one with the largest support times ``1 / (1 + (r / s)²)²``, with the distance r of
@@ -121,31 +113,29 @@ def fill_planes(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     first_row, end_row : int
-    delay : ndarray, shape (row, col)
-    window_plane : ndarray, shape (3, half + row + half, half + col + half)
-        As filled by `fill_window_planes`, with a margin.
-    support : ndarray, shape (half + row + half, half + col + half)
-        Likewise; 0 in the margin.
+    delay : ndarray, shape (half + row + half, half + col + half)
+    windows : ndarray, shape (4, half + row + half, half + col + half)
+        Support of each window, the share of its weight on the plane, 0 in the margin; delay in its
+        middle, and its change from row to row and from col to col.
     half : int
     plane : ndarray, shape (3, row, col)
-        `col` is a multiple of LANES. All are float32.
+        Delay in the pixel, and its changes; `col` is a multiple of LANES. All are float32.
     """
     cols, n, reach = plane.shape[2], 2 * half + 1, LANES + 2 * half
-    near = np.exp(-0.5 * (np.arange(-half, half + 1) / _NEAR_PIXELS) ** 2).astype(np.float32)
+    near = np.exp(-0.5 * (np.arange(-half, half + 1) / NEAR_PIXELS) ** 2).astype(np.float32)
     for row in range(first_row, end_row):
-        windows, best = lane_rows(4 * _WIDE), lane_rows(5)
+        met, best = lane_rows(4 * _WIDE), lane_rows(5)
         for first in range(0, cols, LANES):
-            best[:LANES] = 0.0
-            best[LANES : 2 * LANES] = best[4 * LANES :] = delay[row, first : first + LANES]
-            best[2 * LANES : 4 * LANES] = 0.0
+            own = delay[row + half, half + first : half + first + LANES]
+            best[:] = 0.0
+            best[LANES : 2 * LANES] = best[4 * LANES :] = own
             for i in range(n):
                 for k in range(4):
-                    from_row = support[row + i] if k == 0 else window_plane[k - 1, row + i]
                     to = k * _WIDE * LANES
-                    windows[to : to + reach] = from_row[first : first + reach]
+                    met[to : to + reach] = windows[k, row + i, first : first + reach]
                 y = np.float32(half - i)
                 for j in range(n):
-                    _take_better(windows[j:], y, np.float32(half - j), near[i] * near[j], best)
+                    _take_better(met[j:], y, np.float32(half - j), near[i] * near[j], best)
             for k in range(3):
                 plane[k, row, first : first + LANES] = best[(k + 1) * LANES : (k + 2) * LANES]
 

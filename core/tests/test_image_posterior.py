@@ -21,12 +21,14 @@ from core.estimators.image_model import (
 from core.estimators.image_posterior import Link, image_posterior_of, least_probability, planes
 from core.inference.flux_model import FluxModel
 from core.inspection import pixel_report
+from core.kernels.blocks import LANES
 from core.kernels.messages import fill_posterior
+from core.kernels.planes import NEAR_PIXELS, OWN_SPREAD_BINS, fill_planes
 from core.metrics import calibration_error, reliability, restoration_degree
 from core.scene import scenes
 from core.simulation import simulate
 from core.studies.trials import Condition
-from core.tests.twins import log_likelihood, posterior_of_chain
+from core.tests.twins import best_planes, log_likelihood, posterior_of_chain
 from core.trigger import rate_per_bin
 
 ALIKE, SCALE = 0.7, 0.4
@@ -84,6 +86,19 @@ def test_the_plane_of_a_pixel_beside_another_surface_is_that_of_its_own() -> Non
     np.testing.assert_allclose(plane[0][kept], delay[kept], atol=0.5)
     np.testing.assert_allclose(plane[1][kept], down[kept], atol=0.25)
     np.testing.assert_allclose(plane[2][kept], right[kept], atol=0.25)
+
+
+def test_each_pixel_takes_the_plane_that_suits_it_best() -> None:
+    rng, half, (rows, cols) = np.random.default_rng(1), 2, (7, 2 * LANES)
+    delay = rng.uniform(20, 40, (rows, cols)).astype(np.float32)
+    windows = rng.normal(size=(4, rows, cols)).astype(np.float32)
+    windows[0], windows[1] = rng.uniform(size=(rows, cols)), rng.uniform(20, 40, (rows, cols))
+    margin, found = ((half, half), (half, half)), np.empty((3, rows, cols), np.float32)
+    fill_planes(0, rows, np.pad(delay, margin), np.pad(windows, ((0, 0), *margin)), half, found)
+    expected = best_planes(
+        delay.astype(float), windows.astype(float), half, OWN_SPREAD_BINS, NEAR_PIXELS
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)  # of float32
 
 
 def degree(condition: Condition, method: str, seed: int = 900) -> float:

@@ -50,3 +50,37 @@ def posterior_of_chain(
     total = joint.sum()
     axes = range(n_pixels)
     return np.stack([joint.sum(axis=tuple(a for a in axes if a != i)) / total for i in axes])
+
+
+def best_planes(
+    delay: NDArray[np.float64],
+    windows: NDArray[np.float64],
+    half: int,
+    spread_bins: float,
+    near_pixels: float,
+) -> NDArray[np.float64]:
+    """Return the planes (3, row, col) that `core.kernels.planes.fill_planes` chooses.
+
+    Parameters
+    ----------
+    delay : ndarray, shape (row, col)
+    windows : ndarray, shape (4, row, col)
+        Support of the window around each pixel, and its plane.
+    half : int
+    spread_bins, near_pixels : float
+    """
+    rows, cols = delay.shape
+    found = np.empty((3, rows, cols))
+    for row, col in np.ndindex(rows, cols):
+        most = 0.0
+        for y, x in np.ndindex(rows, cols):
+            if max(abs(row - y), abs(col - x)) > half:
+                continue
+            support, middle, down, right = windows[:, y, x]
+            here = middle + down * (row - y) + right * (col - x)
+            distance = np.hypot(row - y, col - x) / near_pixels
+            suits = support * np.exp(-(distance**2) / 2)
+            suits /= (1 + ((delay[row, col] - here) / spread_bins) ** 2) ** 2
+            if suits > most:
+                most, found[:, row, col] = suits, (here, down, right)
+    return found
