@@ -2,7 +2,8 @@
 
 Two servers run side by side, one with all patches and one with a single patch switched off. Each
 round opens a page on both, one after the other, and moves its sliders: through a client of Bokeh's
-protocol for patches of the server, through Chromium for patches of the browser. CPU time depends
+protocol for patches of the server, through Chromium for patches of the browser, which also goes to
+another page and back. CPU time depends
 little on what else the machine does; messages, bytes, layouts and style computations are counted.
 The table has medians, and the ratio off/on with its range over the rounds. The rows "server" and
 "browser" compare two equal servers: a gain that does not exceed their range is noise.
@@ -35,6 +36,7 @@ OPENINGS = 4
 WIRE_STEPS = 80
 BROWSER_STEPS = 12
 DRAG_MOVES = 60
+PAGES = ("Inspect", "Explore", "Compare", "Explore")
 QUIET_S = 0.4
 """Time without a message after which everything has been drawn."""
 
@@ -104,6 +106,14 @@ class Meter:
         self._latest_s = time.monotonic()
         slider.press("ArrowRight" if n // 10 % 2 else "ArrowLeft")
 
+    def tour(self, page: Page) -> None:
+        """Go to other pages of the app and back."""
+        for name in PAGES:
+            before = page.url
+            page.get_by_role("button", name=name, exact=True).filter(visible=True).first.click()
+            page.wait_for_url(lambda url, before=before: url != before)
+            self.settle()
+
     def totals(self) -> Costs:
         """Costs so far."""
         found = self._session.send("Performance.getMetrics")["metrics"]
@@ -129,7 +139,7 @@ class Meter:
 
 
 def browser_costs(browser: Browser, address: str) -> Costs:
-    """Costs of opening a page, of each step of a slider, and of each value of a drag."""
+    """Costs of opening the app, of a step of a slider, of a value of a drag, of going to a page."""
     meter = Meter(address)
     page = open_page(browser, address, watch=meter.watch)
     meter.settle()
@@ -147,6 +157,10 @@ def browser_costs(browser: Browser, address: str) -> Costs:
         meter.press(slider, n)
     meter.settle()
     dragged = meter.totals()
+    meter.tour(page)  # which builds the other pages
+    built = meter.totals()
+    meter.tour(page)
+    went = meter.totals()
     page.close()
     return {
         **{f"opening: {name}": value for name, value in start.items()},
@@ -154,6 +168,7 @@ def browser_costs(browser: Browser, address: str) -> Costs:
         "step: response, ms": float(np.median(responses_ms)),
         "views": float(views),
         **{f"drag: {name}": (dragged[name] - stepped[name]) / DRAG_MOVES for name in start},
+        **{f"going: {name}": (went[name] - built[name]) / len(PAGES) for name in start},
     }
 
 

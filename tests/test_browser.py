@@ -707,6 +707,7 @@ def test_a_page_opens_complete_follows_the_theme_and_shows_scenes_in_every_way(p
         new.get_by_role("button", name=of_cloud, exact=True).last.click()
         shown = look_again(new, shown, "image", "cloud")
     new.evaluate(LAY_OUT_UNFINISHED)  # must not raise
+    assert new.evaluate(HIDE_AND_SHOW) == {"laid out": 1, "sheets written": 0}
     expect(warning(new)).to_be_hidden()
     expect_inspect_in_place(new)
 
@@ -720,6 +721,23 @@ LAY_OUT_UNFINISHED = f"""() => {{
   plot.layout = layout;
 }}"""
 """Lay out the page when one of its plots has been built, but not laid out."""
+
+
+HIDE_AND_SHOW = f"""async () => {{
+  {VIEWS}
+  const page = views.find(({{ model, is_managed }}) => model.name === "Template" && !is_managed);
+  const [part] = views.filter(({{ model }}) => model.type === "Figure" && model.visible);
+  let times = 0;
+  const {{ update_layout: update }} = page;
+  page.update_layout = () => {{ times++; update.call(page); }};
+  const written = new MutationObserver(() => {{}});
+  views.forEach(({{ style }}) => style?.el && written.observe(style.el, {{ childList: true }}));
+  for (const visible of [false, true]) part.model.visible = visible;
+  await Promise.resolve();
+  delete page.update_layout;
+  return {{ "laid out": times, "sheets written": written.takeRecords().length }};
+}}"""
+"""Hide and show a plot at once; return how often the page was laid out, and styles were written."""
 
 
 COVERED = """

@@ -108,6 +108,8 @@ TOUR_BUTTON = {
     "@media (max-width: 500px)": {"minWidth": 0, "padding": "5px 2px", "fontSize": "9px"},
 }
 
+NOT_BUSY = {"display": "none"}  # unlike `visible`, at no layout of the page
+
 PRINT = """
 @media print {
   header, nav, .MuiToolbar-root { display: none !important; }
@@ -285,7 +287,7 @@ class Layout:
             stylesheets=[PRINTED_ONLY], sizing_mode="stretch_width", margin=(4, 12)
         )
         self._busy = pmui.LinearProgress(
-            visible=False, variant="indeterminate", sizing_mode="stretch_width", margin=0
+            variant="indeterminate", sx=NOT_BUSY, height=4, sizing_mode="stretch_width", margin=0
         )
         self._source = select(
             "Scene or capture",
@@ -423,7 +425,7 @@ class Layout:
         self._link.follow(state, session.query, session.is_settled, later, at_once)
         self._link.param.watch(lambda event: session.recall(event.new[0]), "visited")
         session.estimate.changed.subscribe(self._show_answer)
-        tasks.busy.changed.subscribe(partial(setattr, self._busy, "visible"))
+        tasks.busy.changed.subscribe(self._show_busy)
         session.failures.shown.subscribe(self._show_failure)
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
@@ -481,6 +483,9 @@ class Layout:
         """Change between light and dark mode, which the address keeps."""
         is_dark = self._link.dark = self.page.dark_theme
         self.pages.paint(is_dark)
+
+    def _show_busy(self, is_busy: bool) -> None:
+        self._busy.sx = {} if is_busy else NOT_BUSY
 
     def _show_failure(self, sentence: str) -> None:
         self.alert.text = sentence[:2000]

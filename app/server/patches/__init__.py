@@ -68,6 +68,7 @@ PATCHES = (
     Patch("list_keys", {"panel-material-ui": "0.16"}),
     Patch("lost_graphics", _BOKEH),
     Patch("narrow_window", _PANEL),
+    Patch("one_layout", _BOKEH | _PANEL),
     Patch("plot_names", _BOKEH),
     Patch("server_wins", _PANEL),
     Patch("session_ended", _BOKEH),
