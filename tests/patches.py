@@ -3,10 +3,10 @@
 Two servers run side by side, one with all patches and one with a single patch switched off. Each
 round opens a page on both, one after the other, and moves its sliders: through a client of Bokeh's
 protocol for patches of the server, through Chromium for patches of the browser, which also goes to
-another page and back. CPU time depends
-little on what else the machine does; messages, bytes, layouts and style computations are counted.
-The table has medians, and the ratio off/on with its range over the rounds. The rows "server" and
-"browser" compare two equal servers: a gain that does not exceed their range is noise.
+other pages and back. CPU time depends little on what else the machine does; messages, bytes,
+layouts and style computations are counted. The table has medians, and the ratio off/on with its
+range over the rounds. The rows "server" and "browser" compare two equal servers: a gain that does
+not exceed their range is noise.
 """
 
 from __future__ import annotations
@@ -106,12 +106,12 @@ class Meter:
         self._latest_s = time.monotonic()
         slider.press("ArrowRight" if n // 10 % 2 else "ArrowLeft")
 
-    def tour(self, page: Page) -> None:
+    def tour(self) -> None:
         """Go to other pages of the app and back."""
         for name in PAGES:
-            before = page.url
-            page.get_by_role("button", name=name, exact=True).filter(visible=True).first.click()
-            page.wait_for_url(lambda url, before=before: url != before)
+            before = self._page.url
+            self._page.get_by_role("button", name=name, exact=True).click()
+            self._page.wait_for_url(lambda url, before=before: url != before)
             self.settle()
 
     def totals(self) -> Costs:
@@ -157,9 +157,9 @@ def browser_costs(browser: Browser, address: str) -> Costs:
         meter.press(slider, n)
     meter.settle()
     dragged = meter.totals()
-    meter.tour(page)  # which builds the other pages
+    meter.tour()  # which builds the other pages
     built = meter.totals()
-    meter.tour(page)
+    meter.tour()
     went = meter.totals()
     page.close()
     return {

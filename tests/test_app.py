@@ -1104,3 +1104,14 @@ def test_only_the_first_estimate_of_a_scene_is_shared_and_only_where_requests_ar
     assert opened() is opened()
     assert opened(**{"light.sbr": "0.2"}) is not opened()
     assert opened(source="file") is not opened(source="file")
+
+
+def test_the_bar_of_long_work_comes_and_goes_in_its_own_place(own_layout):
+    (bar,) = own_layout.page.select(pmui.LinearProgress)
+    place = bar.visible, bar.height
+    shown = []
+    for is_busy in (False, True, False):
+        own_layout.session.tasks.busy.changed.emit(is_busy)
+        shown.append("display" not in bar.sx)
+        assert (bar.visible, bar.height) == place == (True, 4)
+    assert shown == [False, True, False]

@@ -707,7 +707,11 @@ def test_a_page_opens_complete_follows_the_theme_and_shows_scenes_in_every_way(p
         new.get_by_role("button", name=of_cloud, exact=True).last.click()
         shown = look_again(new, shown, "image", "cloud")
     new.evaluate(LAY_OUT_UNFINISHED)  # must not raise
-    assert new.evaluate(HIDE_AND_SHOW) == {"laid out": 1, "sheets written": 0}
+    assert new.evaluate(HIDE_AND_SHOW) == {
+        "laid out": 1,
+        "sheets written": 0,
+        "measured for components": 0,
+    }
     expect(warning(new)).to_be_hidden()
     expect_inspect_in_place(new)
 
@@ -735,9 +739,19 @@ HIDE_AND_SHOW = f"""async () => {{
   for (const visible of [false, true]) part.model.visible = visible;
   await Promise.resolve();
   delete page.update_layout;
-  return {{ "laid out": times, "sheets written": written.takeRecords().length }};
+  let measured = 0;
+  page.compute_layout = () => {{ measured++; }};
+  const components = views.filter(({{ model }}) => model.type.startsWith("panel.models.esm"));
+  const leaves = components.filter(({{ child_views }}) => child_views.length === 0);
+  leaves.forEach((each) => each.after_resize());
+  delete page.compute_layout;
+  return {{
+    "laid out": times,
+    "sheets written": written.takeRecords().length,
+    "measured for components": leaves.length > 20 ? measured : undefined,
+  }};
 }}"""
-"""Hide and show a plot at once; return how often the page was laid out, and styles were written."""
+"""Hide and show a plot at once, tell components that they were resized; return what followed."""
 
 
 COVERED = """
