@@ -8,12 +8,13 @@ import numpy as np
 from numba import njit
 
 from core.kernels.parallel import COMPILED
-from core.kernels.streams import pixel_key, uniform_at
+from core.kernels.streams import DRAWN_UNITS, integer_at, pixel_key, uniform_at
 
 _GAMMA, _GAUSSIAN, _MEASURED = range(3)
 SHAPE_CODES = {"gamma": _GAMMA, "gaussian": _GAUSSIAN, "measured": _MEASURED}
 _SQRT_HALF = math.sqrt(0.5)
 _CELLS = 256  # of a guide table
+_CELL = np.uint64(DRAWN_UNITS // _CELLS)
 
 
 @njit(**COMPILED)
@@ -56,35 +57,28 @@ def fill_probability(first, end, photons):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED, inline="always")
-def _draw_pixel(fired_by, begin, end, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
+def _draw_pixel(fired_by, begin, end, key, guide, counts):  # type: ignore[no-untyped-def]
     """Add the first-photon draws of the pulses from `begin` to before `end` to `counts`.
 
     The last element of `counts` counts "no trigger".
 
-    ``fired_by[k]`` is the probability of a trigger by the end of bin k; its last element, above 1,
-    ends every search. The guide table holds the bin of the lowest number in each of its cells of
-    ``[0, 1)``, found by counting the ends of bins in each cell; its last element is beyond 1.
-    `uniform` is a buffer for a batch of numbers, drawn in a loop that vectorises.
+    ``fired_by[k]`` is the probability of a trigger by the end of bin k, in `DRAWN_UNITS`; its last
+    element, above all draws, ends every search. The guide table holds the bin of the lowest number
+    in each of its cells, found by counting the ends of bins in each cell.
     """
-    n_cells = guide.size - 1
     guide[:] = 0
     for each in range(fired_by.size - 1):
-        guide[np.int64(math.ceil(fired_by[each] * n_cells))] += np.uint32(1)
-    for cell in range(n_cells):
+        guide[(fired_by[each] + _CELL - np.uint64(1)) // _CELL] += np.uint32(1)
+    for cell in range(guide.size - 1):
         guide[cell + 1] += guide[cell]
-    done = begin
-    while done < end:
-        batch = min(uniform.size, end - done)
-        for i in range(batch):
-            uniform[i] = uniform_at(key, done + i)
-        for i in range(batch):
-            k = np.uint64(guide[np.uint64(uniform[i] * n_cells)])
-            # A step without a branch settles nearly every draw; a mispredicted branch costs five.
-            k += np.uint64(fired_by[k] <= uniform[i])
-            while fired_by[k] <= uniform[i]:
-                k += np.uint64(1)
-            counts[k] += 1
-        done += batch
+    for pulse in range(begin, end):
+        drawn = integer_at(key, pulse)
+        k = np.uint64(guide[drawn // _CELL])
+        # A step without a branch settles nearly every draw; a mispredicted branch costs five.
+        k += np.uint64(fired_by[k] <= drawn)
+        while fired_by[k] <= drawn:
+            k += np.uint64(1)
+        counts[k] += 1
 
 
 @njit(**COMPILED)
@@ -92,14 +86,12 @@ def draw_pulses(first, end, triggered, first_pulse, end_pulse, seed, cube):  # t
     """Add first-photon counts (pixel, bin) of the pulses `first_pulse` to before `end_pulse`."""
     n_bins = cube.shape[1]
     for pixel in range(first, end):
-        fired_by = np.full(n_bins + 1, 2.0)
+        fired_by = np.full(n_bins + 1, np.uint64(2 * DRAWN_UNITS))
         for k in range(n_bins):
-            fired_by[k] = triggered[pixel, 1 + k]
-        guide = np.empty(_CELLS + 1, np.uint32)
-        uniform = np.empty(64)
-        counts = np.zeros(n_bins + 1, np.int64)
+            fired_by[k] = np.uint64(math.ceil(triggered[pixel, 1 + k] * DRAWN_UNITS))
+        guide, counts = np.empty(_CELLS + 1, np.uint32), np.zeros(n_bins + 1, np.int64)
         key = pixel_key(seed, pixel)
-        _draw_pixel(fired_by, first_pulse, end_pulse, key, guide, uniform, counts)
+        _draw_pixel(fired_by, first_pulse, end_pulse, key, guide, counts)
         for k in range(n_bins):
             cube[pixel, k] += counts[k]
 

@@ -10,6 +10,9 @@ from numba import njit
 
 from core.kernels.parallel import COMPILED
 
+DRAWN_UNITS = 2**53
+"""Integers below it are drawn, which are exact as floating-point numbers."""
+
 
 @njit(**COMPILED, inline="always")
 def _splitmix64(state):  # type: ignore[no-untyped-def]
@@ -26,10 +29,16 @@ def pixel_key(seed, pixel):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED, inline="always")
+def integer_at(key, draw):  # type: ignore[no-untyped-def]
+    """Uniform integer below `DRAWN_UNITS` at position `draw` of a stream."""
+    state = key + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15)
+    return _splitmix64(state) >> np.uint64(11)
+
+
+@njit(**COMPILED, inline="always")
 def uniform_at(key, draw):  # type: ignore[no-untyped-def]
     """Uniform number in [0, 1) at position `draw` of a stream."""
-    state = key + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15)
-    return np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53
+    return np.float64(integer_at(key, draw)) * (1 / DRAWN_UNITS)
 
 
 @njit(**COMPILED)
