@@ -7,8 +7,11 @@ confidence, its delay ``d`` has the posterior density ::
 
 over the signal levels ``l`` of `core.inference.flux`, with the likelihood ``L_l`` of the whole
 histogram (`core.inference.likelihood`). The levels are a grid, whose errors would bias intervals of
-many photons: signal and background of each are fitted to the pixel. The interval is about the
-surface and not about the method: it is the same for all estimates with the same window.
+many photons: signal and background of each are fitted to the pixel. What the fit leaves uncertain
+makes the delay uncertain, too: the density is raised to the power ``1 / ψ``, where ψ is the
+variance of the delay with unknown fluxes over that with known ones, by the Fisher information. The
+interval is about the surface and not about the method: it is the same for all estimates with the
+same window.
 
 Where the counts near the echo differ from the model by more than chance (another pulse, a second
 surface), the density is raised to the power ``1 / φ``, with the dispersion φ of these counts
@@ -40,6 +43,7 @@ _DROP = 12.0  # log density below the maximum, at which a delay is negligible
 _MOST_ZOOMS = 12
 _LEVEL_ERROR = LEVEL_SPAN ** (0.5 / (LEVELS - 1)) - 1  # relative, of half a step between levels
 _FITTING_STEPS = 5
+_LEAST_KNOWN = 0.1  # of the information on a delay; less would be left by rounding
 _N_FITTED = 3  # delay, signal and background
 _CLEAR_DEVIATIONS = 5.0  # of the dispersion of the counts, beyond which it is hardly chance
 _TAIL = 1e-6  # share of the photons of an echo that is left out on either side
@@ -65,7 +69,7 @@ def range_intervals(
 
     They are calibrated: of the estimates within `TOLERANCE_BINS` of the surface, a share of each
     level have an interval that contains the range of the surface. Whether a surface is there is
-    what `RangeImage.confidence` says. Echoes that fire nearly every pulse, of more than about three
+    what `RangeImage.confidence` says. Echoes that fire nearly every pulse, of more than about four
     photons per pulse, hide their flux: their intervals are too narrow.
 
     Parameters
@@ -153,14 +157,16 @@ def _quantiles_bins(
     window = _window(capture, pixels, estimate_bin)
     delay = _nodes(low, high, _COARSE_NODES)
     best = np.argmax(_log_density(window, delay), axis=1)[:, np.newaxis]
-    window = _fitted(window, np.take_along_axis(delay, best, axis=1))
-    delay, density = _zoomed(window, low, high)
+    at = np.take_along_axis(delay, best, axis=1)
+    window = _fitted(window, at)
+    widening = _flux_widening(window, at)
+    delay, density = _zoomed(window, low, high, widening)
     best = np.argmax(density, axis=1)[:, np.newaxis]
     dispersion = _dispersion(window, np.take_along_axis(delay, best, axis=1))
     wide = dispersion[:, 0] > 1
     if wide.any():
-        found = _zoomed(window.some(wide), low[wide], high[wide], dispersion[wide])
-        delay[wide], density[wide] = found
+        more = widening[wide] * dispersion[wide]
+        delay[wide], density[wide] = _zoomed(window.some(wide), low[wide], high[wide], more)
     # Cumulative density by trapezoids, relative to the whole: the steps of a pixel are equal.
     mass = np.zeros_like(density)
     np.cumsum((density[:, 1:] + density[:, :-1]) / 2, axis=1, out=mass[:, 1:])
@@ -294,12 +300,21 @@ def _dispersion(window: _Window, delay: Floats) -> Floats:
 
 def _log_density(window: _Window, delay: Floats) -> Floats:
     """Logarithm of ``p(d)`` up to a constant of each pixel, at delays (pixel, node)."""
-    share, fired = _share(window, delay), window.fired[:, np.newaxis]
-    unfired = window.unfired.sum(axis=1)
+    log = np.logaddexp.reduce(_log_levels(window, _share(window, delay)))
+    at = np.clip(delay.astype(np.intp), 0, window.depth.size - 1)
+    return np.asarray(log + np.log(window.depth)[at])
+
+
+def _log_levels(window: _Window, share: Floats) -> Floats:
+    """Logarithm of the contribution of each level to ``p(d)`` but for `depth`.
+
+    From `_share` (pixel, node, bin), shape (level, pixel, node).
+    """
+    fired, unfired = window.fired[:, np.newaxis], window.unfired.sum(axis=1)
     unfired_echo = np.vecdot(share, window.unfired[:, np.newaxis])
-    log = np.full(delay.shape, -np.inf)
+    log = np.empty((len(window.signal), *share.shape[:2]))
     levels = zip(window.signal, window.background, window.log_weight, strict=True)
-    for signal, background, weight in levels:
+    for level, (signal, background, weight) in enumerate(levels):
         rate = share * signal[:, np.newaxis, np.newaxis]
         rate += background[:, np.newaxis, np.newaxis]
         if window.is_first:
@@ -307,9 +322,8 @@ def _log_density(window: _Window, delay: Floats) -> Floats:
         found = np.vecdot(np.log(rate, out=rate), fired)
         found -= signal[:, np.newaxis] * unfired_echo
         found += (weight - unfired * background)[:, np.newaxis]
-        log = np.logaddexp(log, found)
-    at = np.clip(delay.astype(np.intp), 0, window.depth.size - 1)
-    return np.asarray(log + np.log(window.depth)[at])
+        log[level] = found
+    return log
 
 
 def _fitted(window: _Window, delay: Floats) -> _Window:
@@ -320,8 +334,7 @@ def _fitted(window: _Window, delay: Floats) -> _Window:
     """
     p, fired, unfired = _share(window, delay)[:, 0], window.fired, window.unfired
     signal, background = window.signal, window.background
-    n_bins = window.depth.size
-    precision = 1 / (_LEVEL_ERROR * signal) ** 2  # of the signal, and of all background
+    n_bins, precision = window.depth.size, _flux_precision(signal)
     s, b = signal, background
     for _ in range(_FITTING_STEPS):
         rate = b[..., np.newaxis] + s[..., np.newaxis] * p
@@ -341,21 +354,54 @@ def _fitted(window: _Window, delay: Floats) -> _Window:
     return window._replace(signal=s, background=b, log_weight=window.log_weight - penalty)
 
 
+def _flux_precision(signal: Floats) -> Floats:
+    """Reciprocal prior variance of the signal of levels, and of their background over the gate."""
+    return np.asarray(1 / (_LEVEL_ERROR * signal) ** 2)
+
+
+def _flux_widening(window: _Window, delay: Floats) -> Floats:
+    """Variance of a delay whose fluxes are fitted, too, over that if they were known, (pixel, 1).
+
+    By the Fisher information at delays (pixel, 1), for the likeliest level. Where an echo fires
+    nearly every pulse, a brighter one looks like an earlier one.
+    """
+    share, density = _share(window, delay), np.zeros_like(window.fired)
+    until_s = (window.edges - delay) * window.bin_width_s
+    density[:, :-1] = -np.diff(window.pulse.density(until_s), axis=1) * window.bin_width_s
+    level = np.argmax(_log_levels(window, share), axis=0).T
+    signal, background = (
+        np.take_along_axis(each, level, axis=0)[0] for each in (window.signal, window.background)
+    )
+    s, p = signal[:, np.newaxis], share[:, 0]
+    rate = background[:, np.newaxis] + s * p
+    armed = window.unfired + window.fired if window.is_first else window.unfired
+    information = armed / (np.expm1(rate) if window.is_first else rate)
+    precision = _flux_precision(signal)
+    d = s * density
+    dd, ds, db = (np.vecdot(information, d * each) for each in (d, p, 1.0))
+    ss = np.vecdot(information, p**2) + precision
+    sb = np.vecdot(information, p)
+    bb = information.sum(axis=1) + precision * window.depth.size**2
+    lost = (bb * ds**2 - 2 * sb * ds * db + ss * db**2) / (ss * bb - sb**2)
+    known = 1 - lost / np.maximum(dd, np.finfo(float).tiny)
+    return np.asarray(1 / np.maximum(known, _LEAST_KNOWN))[:, np.newaxis]
+
+
 def _nodes(low: Floats, high: Floats, n_nodes: int) -> Floats:
     """Equidistant delays from `low` to `high` (pixel,), shape (pixel, node)."""
     return np.linspace(low, high, n_nodes, axis=1)
 
 
-def _zoomed(
-    window: _Window, low: Floats, high: Floats, dispersion: Floats | None = None
-) -> tuple[Floats, Floats]:
-    """Delays between limits (pixel,) that matter, and their relative densities, (pixel, node)."""
+def _zoomed(window: _Window, low: Floats, high: Floats, widening: Floats) -> tuple[Floats, Floats]:
+    """Delays between limits (pixel,) that matter, and their relative densities, (pixel, node).
+
+    The densities are raised to the power ``1 / widening``, (pixel, 1).
+    """
     for _ in range(_MOST_ZOOMS):
         delay = _nodes(low, high, _NODES)
         log = _log_density(window, delay)
         log -= log.max(axis=1, keepdims=True)
-        if dispersion is not None:
-            log /= dispersion
+        log /= widening
         inside = log > -_DROP
         first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
         last = np.minimum(_NODES - np.argmax(inside[:, ::-1], axis=1), _NODES - 1)

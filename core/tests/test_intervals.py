@@ -96,10 +96,34 @@ def twin(capture: Capture, row: int, col: int, estimate_bin: float, level: float
         s, b = np.exp(found.x) * (signal, background)
         penalty = ((s - signal) ** 2 + (b - background) ** 2) / (2 * sd**2)
         fitted.append((weight * math.exp(-penalty), s, b))
+    likeliest = max(fitted, key=lambda each: math.log(each[0]) + likelihood(best, *each[1:])[0])
     delay = np.linspace(*window, 20_001)
-    log = log_density(delay, fitted)
+    log = log_density(delay, fitted) / widening(capture, counts, best[0], *likeliest[1:])
     mass = np.cumsum(np.exp(log - log.max()))
     return np.interp([(1 - level) / 2, (1 + level) / 2], mass / mass[-1], delay)
+
+
+def widening(
+    capture: Capture, counts: np.ndarray, delay: float, signal: float, background: float
+) -> float:
+    """Variance of a delay if signal and background are unknown, too, over that if they are known.
+
+    From the Fisher information matrix, by differences of the rates.
+    """
+    at, steps = np.array([delay, signal, background]), np.diag([1e-6, 1e-6, 1e-6])
+
+    def rates(d: float, s: float, b: float) -> np.ndarray:
+        return rate_per_bin(d, s, b, capture.pulse, capture.acquisition)
+
+    slopes = np.array([(rates(*(at + h)) - rates(*(at - h))) / 2e-6 for h in steps])
+    rate, n_pulses = rates(*at), capture.gated_pulses
+    if n_pulses is None:
+        matrix = slopes / rate @ slopes.T
+    else:
+        armed = n_pulses - np.cumsum(counts) + counts
+        matrix = slopes * (armed / np.expm1(rate)) @ slopes.T
+    prior = 1 / ((LEVEL_SPAN ** (0.5 / (LEVELS - 1)) - 1) * signal) ** 2
+    return float(np.linalg.inv(matrix + np.diag([0.0, prior, prior]))[0, 0] * matrix[0, 0])
 
 
 @pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
