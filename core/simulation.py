@@ -20,28 +20,17 @@ from numbers import Integral
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse, pulses_sent
 from core.capture import Capture
 from core.checks import require
 from core.kernels.parallel import on_threads
-from core.kernels.simulate import (
-    SHAPE_CODES,
-    add_echo_photons,
-    draw_pulses,
-    fill_probability,
-    fire_once,
-)
+from core.kernels.simulate import SHAPE_CODES, add_echo_photons, fire_once
 from core.pulse_groups import PulseGroups, group_sizes
 from core.scene import Scene, parts_of
+from core.trigger import EXPONENTIAL, add_triggers, count_type, draw_triggers, to_probability
 
 _Flux = TypeVar("_Flux", float, Floats)
-
-# With more pulses numpy's multinomial is faster: its time does not depend on their number.
-PULSES_DRAWN_ONE_BY_ONE = 8192
-
-_EXPONENTIAL = 16  # counts that other kernels process in the time of one
 
 
 def simulate(
@@ -91,19 +80,13 @@ def simulate(
     require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
     _require_seed(seed)
     shape = np.shape(scene.range_m)
-    cube: NDArray[np.unsignedinteger] = np.zeros(
-        (np.size(scene.range_m), acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32
-    )
     groups = None
     if n_groups is not None:
         groups = _draw_groups(scene, acquisition, flux, pulse, seed, n_groups)
-        cube = groups.total.astype(cube.dtype)
-    elif n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
-        triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
-        _draw_pulses(triggered, 0, n_pulses, seed, cube)
+        cube = groups.total.astype(count_type(n_pulses))
     else:
         triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
-        _draw_multinomial(triggered, n_pulses, seed, cube)
+        cube = draw_triggers(triggered, n_pulses, seed)
     is_plain = set(parts_of(scene)) <= {"reflectivity", "falloff"}
     source = f"simulated, seed {seed}, SBR {flux.sbr:g}, PPP {flux.signal:g}"
     return Capture(
@@ -126,7 +109,7 @@ def _draw_groups(
     sizes = group_sizes(n_pulses, n_groups)
     counts = np.zeros(
         (n_groups, np.size(scene.range_m), acquisition.n_bins),
-        np.uint16 if max(sizes) < 2**16 else np.uint32,
+        count_type(max(sizes)),
     )
     shifts_bins, ends = _shifts_bins(scene, acquisition, pulse), np.cumsum(sizes)
     if scene.motion is not None and scene.motion.speed_m_per_s < 0:
@@ -139,7 +122,7 @@ def _draw_groups(
         if shift != drawn_at:
             at = shifts_bins[shift : shift + 1]
             triggered, drawn_at = _triggered_at(scene, acquisition, flux, pulse, at), shift
-        _draw_pulses(triggered, begin, end, seed, counts[group])
+        add_triggers(triggered, begin, end, seed, counts[group])
         begin = end
     shape = (n_groups, *np.shape(scene.range_m), acquisition.n_bins)
     rate_hz = None if scene.motion is None else scene.motion.pulse_rate_hz
@@ -309,24 +292,4 @@ def add_echo(
     share = samples / (samples[-1] or 1.0)
     bin_taus = bin_width_s / pulse.tau_s
     given = onset_bin, signal, bin_taus, SHAPE_CODES[pulse.shape], share, before
-    on_threads(add_echo_photons, len(before), before.size * _EXPONENTIAL, *given)
-
-
-def to_probability(photons: Floats) -> None:
-    """Replace the photons expected before each bin edge (pixel, edge) by the probability of any."""
-    on_threads(fill_probability, len(photons), photons.size * _EXPONENTIAL, photons)
-
-
-def _draw_pulses(
-    triggered: Floats, begin: int, end: int, seed: int, cube: NDArray[np.unsignedinteger]
-) -> None:
-    n_pixels = len(cube)
-    given = triggered, begin, end, np.uint64(seed), cube
-    on_threads(draw_pulses, n_pixels, n_pixels * (end - begin), *given)
-
-
-def _draw_multinomial(
-    triggered: Floats, n_pulses: int, seed: int, cube: NDArray[np.unsignedinteger]
-) -> None:
-    probability = np.diff(triggered, axis=-1, append=1.0)
-    cube[:] = np.random.default_rng(seed).multinomial(n_pulses, probability)[:, :-1]
+    on_threads(add_echo_photons, len(before), before.size * EXPONENTIAL, *given)

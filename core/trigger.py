@@ -7,6 +7,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.checks import require
+from core.kernels.parallel import on_threads
+from core.kernels.simulate import draw_pulses, fill_probability
+
+# With more pulses numpy's multinomial is faster: its time does not depend on their number.
+PULSES_DRAWN_ONE_BY_ONE = 8192
+
+EXPONENTIAL = 16
+"""Counts that other kernels process in the time of one exponential."""
 
 
 def rate_per_bin(
@@ -84,12 +92,57 @@ def draw_counts(
         Pulses sent; counts are Poisson if None.
     rng : numpy.random.Generator
     """
+    rate = _checked_rate(rate)
     if n_pulses is None:
-        return rng.poisson(np.asarray(rate, float)).astype(np.uint32)
-    chance = trigger_probability(rate)
-    none = np.maximum(1 - chance.sum(axis=-1, keepdims=True), 0)
-    counts = rng.multinomial(n_pulses, np.concatenate([chance, none], axis=-1))
-    return counts[..., :-1].astype(np.uint16 if n_pulses < 2**16 else np.uint32)
+        return rng.poisson(rate).astype(np.uint32)
+    n_bins = rate.shape[-1]
+    photons = np.zeros((rate.size // n_bins, n_bins + 1))
+    np.cumsum(rate.reshape(-1, n_bins), axis=1, out=photons[:, 1:])
+    to_probability(photons)
+    return draw_triggers(photons, n_pulses, int(rng.integers(2**63))).reshape(rate.shape)
+
+
+def to_probability(photons: Floats) -> None:
+    """Replace the photons expected before each bin edge (pixel, edge) by the probability of any."""
+    on_threads(fill_probability, len(photons), photons.size * EXPONENTIAL, photons)
+
+
+def draw_triggers(triggered: Floats, n_pulses: int, seed: int) -> NDArray[np.unsignedinteger]:
+    """Draw histograms from the probability of a trigger before each bin edge.
+
+    Parameters
+    ----------
+    triggered : ndarray, shape (pixel, bin + 1)
+    n_pulses : int
+    seed : int
+        The same seed gives the same counts, for any number of threads.
+
+    Returns
+    -------
+    ndarray of unsigned int, shape (pixel, bin)
+    """
+    n_pixels, n_edges = triggered.shape
+    cube = np.zeros((n_pixels, n_edges - 1), count_type(n_pulses))
+    if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
+        add_triggers(triggered, 0, n_pulses, seed, cube)
+    else:
+        chance = np.diff(triggered, axis=-1, append=1.0)
+        cube[:] = np.random.default_rng(seed).multinomial(n_pulses, chance)[:, :-1]
+    return cube
+
+
+def count_type(most: int) -> type[np.unsignedinteger]:
+    """Return the smaller type for counts up to `most`."""
+    return np.uint16 if most < 2**16 else np.uint32
+
+
+def add_triggers(
+    triggered: Floats, begin: int, end: int, seed: int, cube: NDArray[np.unsignedinteger]
+) -> None:
+    """Draw the pulses from `begin` to before `end` one by one, and add their counts to `cube`."""
+    n_pixels = len(cube)
+    given = triggered, begin, end, np.uint64(seed), cube
+    on_threads(draw_pulses, n_pixels, n_pixels * (end - begin), *given)
 
 
 def first_difference(probability: ArrayLike) -> Floats:

@@ -45,6 +45,28 @@ def learn_shares(likelihood, share):  # type: ignore[no-untyped-def]
             share[level] = (share[level] * found + dark) / (n_pixels + _DARK_PIXELS)
 
 
+@njit(**SUMMING, inline="always")
+def _add_reweighted(echo, none, dark, likely, reweighted):  # type: ignore[no-untyped-def]
+    """Add densities (pixel, bin) of four pixels over their means; return how many have no echo.
+
+    At once, since a sum over bins waits for its last term, and `reweighted` is written once.
+    """
+    e0, e1, e2, e3 = echo[0], echo[1], echo[2], echo[3]
+    m0 = m1 = m2 = m3 = np.float32(0.0)
+    for k in range(likely.size):
+        m0 += e0[k] * likely[k]
+        m1 += e1[k] * likely[k]
+        m2 += e2[k] * likely[k]
+        m3 += e3[k] * likely[k]
+    t0, t1 = dark * none[0] + (1 - dark) * m0, dark * none[1] + (1 - dark) * m1
+    t2, t3 = dark * none[2] + (1 - dark) * m2, dark * none[3] + (1 - dark) * m3
+    w0, w1 = np.float32((1 - dark) / t0), np.float32((1 - dark) / t1)
+    w2, w3 = np.float32((1 - dark) / t2), np.float32((1 - dark) / t3)
+    for k in range(likely.size):
+        reweighted[k] += w0 * e0[k] + w1 * e1[k] + w2 * e2[k] + w3 * e3[k]
+    return dark * (none[0] / t0 + none[1] / t1 + none[2] / t2 + none[3] / t3)
+
+
 @njit(**SUMMING)
 def learn_shares_and_depths(density, n_steps, share, depth):  # type: ignore[no-untyped-def]
     """Estimate the share of no echo and the probabilities of delays likewise, in place.
@@ -57,7 +79,9 @@ def learn_shares_and_depths(density, n_steps, share, depth):  # type: ignore[no-
     takes: so many more pixels would show an echo only because delays are fitted to them.
     """
     n_pixels, n_levels, n_bins = density.shape
-    none, echo = np.empty(n_pixels), np.zeros((n_pixels, n_bins), np.float32)
+    # Four pixels at a time: those added to the last ones have no echo, and are not counted.
+    n_rows = -(-n_pixels // 4) * 4
+    none, echo = np.ones(n_rows), np.zeros((n_rows, n_bins), np.float32)
     for pixel in range(n_pixels):
         none[pixel] = density[pixel, 0, 0]
         for level in range(1, n_levels):
@@ -68,16 +92,11 @@ def learn_shares_and_depths(density, n_steps, share, depth):  # type: ignore[no-
     dark = before
     for _ in range(n_steps):
         likely = depth.astype(np.float32)
-        found, reweighted = _DARK_PIXELS, np.zeros(n_bins, np.float32)
-        for pixel in range(n_pixels):
-            seen = np.float32(0.0)
-            for k in range(n_bins):
-                seen += echo[pixel, k] * likely[k]
-            total = dark * none[pixel] + (1 - dark) * seen
-            found += dark * none[pixel] / total
-            weight = np.float32((1 - dark) / total)
-            for k in range(n_bins):
-                reweighted[k] += weight * echo[pixel, k]
+        found, reweighted = _DARK_PIXELS - (n_rows - n_pixels), np.zeros(n_bins, np.float32)
+        for pixel in range(0, n_rows, 4):
+            found += _add_reweighted(
+                echo[pixel : pixel + 4], none[pixel:], dark, likely, reweighted
+            )
         dark = min(max(found / (n_pixels + _DARK_PIXELS), 1e-12), 1 - 1e-12)  # never 0 or 1
         surfaces, anywhere = 0.0, 0.0
         for k in range(n_bins):

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 
 import numba
 import numpy as np
 import pytest
 from scipy import stats
 
+from core import trigger
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.scene import Scene
 from core.simulation import add_echo, cumulative_trigger_probability, first_photons, simulate
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
-
-module = import_module("core.simulation")  # the package's attribute of that name is the function
 
 DRAWS = 2_000_000  # of a large sample
 # By chance, one fixed seed in ten thousand would fall below.
@@ -63,7 +61,7 @@ def expected_share(flux: Flux, pulse: Pulse, onset_bin: float = ONSET_BIN) -> np
 def test_histograms_follow_equation_1(
     monkeypatch: pytest.MonkeyPatch, flux: Flux, pulse: Pulse, one_by_one_up_to: int
 ) -> None:
-    monkeypatch.setattr(module, "PULSES_DRAWN_ONE_BY_ONE", one_by_one_up_to)
+    monkeypatch.setattr(trigger, "PULSES_DRAWN_ONE_BY_ONE", one_by_one_up_to)
     found = outcomes(simulate(wall(PIXELS), ACQUISITION, flux, pulse, seed=1))
     expected = expected_share(flux, pulse) * found.sum()
     assert expected.min() > 5  # where chi-square holds

@@ -9,10 +9,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy import stats
 
 from core.acquisition import Acquisition, Pulse
 from core.trigger import (
     coates_rate,
+    draw_counts,
     first_difference,
     no_trigger_probability,
     rate_per_bin,
@@ -38,6 +40,29 @@ def test_trigger_probability_is_equation_1(rate: list[float]) -> None:
 def test_a_certain_photon_hides_what_follows() -> None:
     probability = trigger_probability([0.3, np.inf, 0.5])
     np.testing.assert_allclose(probability, [1 - math.exp(-0.3), math.exp(-0.3), 0], rtol=1e-15)
+
+
+@pytest.mark.parametrize("n_pulses", [500, 20_000], ids=["one by one", "multinomial"])
+def test_draws_follow_equation_1(n_pulses: int) -> None:
+    rate = [[0.5, 0.0, 2.0, 0.1], [0.03, 0.02, 0.3, 1.0]]
+    counts = draw_counts([rate] * 50, n_pulses, np.random.default_rng(3))
+    assert (counts.shape, counts.dtype) == ((50, 2, 4), np.uint16)
+    assert not counts[:, 0, 1].any()
+    assert len(np.unique(counts[:, 1, 3])) > 10  # pixels are independent
+    for found, of in zip(counts.sum(axis=0, dtype=int), rate, strict=True):
+        share = np.array(equation_1(of))
+        seen = share > 0
+        outcomes = np.append(found[seen], 50 * n_pulses - found.sum())
+        expected = 50 * n_pulses * np.append(share[seen], math.exp(-sum(of)))
+        # By chance, one fixed seed in ten thousand would fall below.
+        assert stats.chisquare(outcomes, expected).pvalue > 1e-4
+
+
+def test_draws_of_all_photons_are_poisson() -> None:
+    counts = draw_counts(np.full((100, 100), 3.0), None, np.random.default_rng(0))
+    # Mean and variance, each to four standard errors.
+    assert counts.mean() == pytest.approx(3.0, abs=4 * math.sqrt(3.0) / 100)
+    assert counts.var() == pytest.approx(3.0, abs=4 * math.sqrt(2 * 9.0 + 3.0) / 100)
 
 
 @pytest.mark.parametrize("low", [-1e-9, -np.inf, np.nan])

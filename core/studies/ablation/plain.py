@@ -8,9 +8,10 @@ import numpy as np
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.scene import PARTS, Scene, without
-from core.simulation import add_echo, cumulative_trigger_probability, to_probability
+from core.simulation import add_echo, cumulative_trigger_probability
 from core.studies.outputs import Table
 from core.studies.timing import time_ratio
+from core.trigger import to_probability
 
 
 def plain_triggered(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse) -> Floats:
