@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
+from typing import get_args
 
 import numpy as np
 
 from core.acquisition import Acquisition, Flux
-from core.capture import Capture
+from core.capture import Capture, Detection
 from core.effects import Motion
 from core.estimators import ESTIMATORS, RangeImage, estimate
 from core.inference import fit_of, flux_model_of
-from core.inspection import pixel_report
+from core.inspection import maps, pixel_report
+from core.reductions import share_of_pulses
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.tracking import PRESETS, tracking_signals
@@ -63,10 +65,12 @@ def warm_up(
         steps += [
             partial(estimated, "peak", returns=2),
             _use_neighbours,
+            partial(_thin_and_map, small),
             lambda: fit_of(small()),
             *(partial(estimated, method, large) for method in ESTIMATORS),
             partial(estimated, "peak", large, returns=2),
             lambda: fit_of(large()),
+            partial(_thin_and_map, large),
         ]
     progress(0, len(steps))
     for done, step in enumerate(steps, 1):
@@ -81,11 +85,18 @@ def _with_large_counts(capture: Capture) -> Capture:
     return replace(capture, cube=np.uint32(_LARGE) * capture.cube, acquisition=acquisition)
 
 
+def _thin_and_map(capture: Callable[[], Capture]) -> None:
+    """Compile what draws a share of the pulses or photons of a capture, and what maps need."""
+    for kind in get_args(Detection):
+        share_of_pulses(replace(capture(), detection=kind), 0.5)
+    maps["SBR"](capture())
+
+
 def _use_neighbours() -> None:
-    """Compile what the image posterior and velocities need where neighbours agree."""
+    """Compile what the image posterior, its returns and velocities need where neighbours agree."""
     wall = scenes["wall"](16)
     capture = simulate(wall, wall.acquisition, Flux(sbr=1.0))
-    for each in (capture, _with_large_counts(capture)):
-        estimate(each, "image_posterior")
+    estimate(capture, "image_posterior", returns=2)
+    estimate(_with_large_counts(capture), "image_posterior")
     passing = replace(wall, motion=Motion(speed_m_per_s=20.0, pulse_rate_hz=20e3))
     estimate(simulate(passing, wall.acquisition, Flux(sbr=1.0), n_groups=8), "velocity")

@@ -83,11 +83,15 @@ for method in [only] if only else core.ESTIMATORS:
     core.run(capture, method)
 if only is None:
     flat = core.simulate(core.scenes["wall"](16), scene.acquisition, core.Flux(sbr=1.0))
-    core.run(flat, "image_posterior")
+    core.estimate(flat, "image_posterior", returns=2)
+    core.reductions.share_of_pulses(flat, 0.5)
+    for each in core.inspection.maps.values():
+        each(flat)
     # Counts beyond uint16.
     bright = core.Capture(np.uint32(2**17) * flat.cube, scene.acquisition, detection="all")
     for method in set(core.ESTIMATORS) - {{"oracle"}}:
         core.run(bright, method)
+    core.reductions.share_of_pulses(bright, 0.5)
 for settings in core.PRESETS.values():
     core.tracking_signals(capture.cube, settings)
     image = core.estimate(capture, "tracking", settings)
