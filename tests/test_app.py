@@ -796,9 +796,9 @@ def test_a_folded_part_is_built_when_it_is_first_opened(own_layout):
 
 def test_form_link_and_script_have_each_option_for_reading_a_file(layout, small_file):
     given = ReadOptions(**EXAMPLES)
-    opened(layout, "Reading options")
     open_file(layout, small_file)
     answer = layout.next_answer()
+    opened(layout, "Reading options")
     for name, option in reading_options().items():
         control(layout, option.label).value = given.as_text(name)
     control(layout, "Read again").clicks += 1
@@ -998,13 +998,19 @@ def test_a_link_unfolds_the_rarely_used_settings_that_it_changes():
         assert found & {MORE, MORE_TRACKING} == {expected}
 
 
+def has_drawn_prior(explore):
+    figure = explore.prior.figure
+    return figure and any(each.visible for each in figure.renderers)
+
+
 def test_estimates_without_an_echo_are_shown_in_place_of_the_stages(layout, explore):
     state = layout.session.state
     state.tracking = PRESETS["literal"]
     layout.next_answer()
     assert "counts below" in explore.remark.text
     state.echo_free = True
-    layout.tasks.run_until(lambda: explore.prior.figure)
+    layout.settle()
+    layout.tasks.run_until(lambda: has_drawn_prior(explore))
     assert [each.visible for each in explore.cards] == [True, False, False, False]
     assert explore.prior.card.visible
     assert explore.prior.figure.x_range is explore.signals.histogram.figure.x_range
@@ -1026,9 +1032,6 @@ def test_estimates_without_an_echo_are_those_of_the_estimate_on_screen(
         assert may_end.wait(60)
         return range_prior_of(answer)
 
-    def is_drawn():
-        return explore.prior.figure and any(each.visible for each in explore.prior.figure.renderers)
-
     monkeypatch.setattr("app.pages.explore.page.range_prior_of", computed)
     with monkeypatch.context() as patched:  # the model is tested at once
         patched.setattr(layout.tasks, "call_later", lambda _, act: act())
@@ -1036,19 +1039,19 @@ def test_estimates_without_an_echo_are_those_of_the_estimate_on_screen(
         state.light = replace(state.light, seed=1)  # another estimate, before the first are known
         layout.next_answer()
     may_end.set()
-    layout.tasks.run_until(is_drawn)
+    layout.tasks.run_until(lambda: has_drawn_prior(explore))
     layout.tasks.run_until(lambda: has_fit(layout.session.answer.capture))
     layout.settle()
     may_end.clear()
     state.light = replace(state.light, seed=2)
     layout.next_answer()
     layout.settle()
-    assert not is_drawn()
+    assert not has_drawn_prior(explore)
     explore.show(False)
     may_end.set()
     layout.tasks.run_one()  # the result arrives off screen
     explore.show(True)
-    layout.tasks.run_until(is_drawn)
+    layout.tasks.run_until(lambda: has_drawn_prior(explore))
     drawn = {each.name: each.data_source.data["y"] for each in explore.prior.figure.renderers}
     for name, values in range_prior_of(layout.session.answer).curves.items():
         np.testing.assert_allclose(drawn[name], values, rtol=1e-6)
