@@ -268,7 +268,7 @@ def score_curves() -> hv.Overlay:
         ),
     ]
     return _panel(layers, "Score of each bin (0: median, 1: maximum)").opts(
-        hv.opts.Overlay(legend_position="right", legend_cols=1)
+        hv.opts.Overlay(legend_position="bottom")  # on a phone there is no room at its side
     )
 
 

@@ -166,7 +166,8 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
         if legend in figure.center:
             legend.stylesheets = [WRAPPED]
         elif legend not in figure.right:
-            legend.stylesheets = [WRAPPED, RAISED]
+            # It reaches beyond the left end of the frame, beside which there is more room.
+            legend.update(stylesheets=[WRAPPED, RAISED], location="top_right")
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
 
 

@@ -76,7 +76,6 @@ class CurvePlot:
             0, LegendItem(label={"field": "title"}, renderers=[renderer])
         )
         self.pane = pane_of(drawing)
-        drawing.legend.spacing = 1  # leaves room for all methods
 
     def update(
         self,
