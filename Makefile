@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 
 # Tests of what has kernels run as plain Python, too: there their lines count as covered, and an index
 # out of bounds is an error. What is marked `compiled` is left out.
-KERNELS := blocks fit image_posterior more_estimators motion posterior reductions refinement returns simulate speed tracking
+KERNELS := blocks fit image_posterior more_estimators motion posterior reductions refinement returns simulate speed tracking trigger
 
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE

@@ -62,7 +62,7 @@ def simulate(
         Keep the counts of so many successive groups of pulses, `Capture.groups`. The pulses of a
         moving scene are then drawn in order, each at the range that the scene has reached
         (`core.effects.Motion.shifts_bins`), otherwise from their mean. A scene at rest has the same
-        counts with groups and without, for up to `PULSES_DRAWN_ONE_BY_ONE` pulses.
+        counts with groups and without, for up to `core.trigger.PULSES_DRAWN_ONE_BY_ONE` pulses.
 
     Returns
     -------

@@ -113,6 +113,7 @@ def draw_triggers(triggered: Floats, n_pulses: int, seed: int) -> NDArray[np.uns
     Parameters
     ----------
     triggered : ndarray, shape (pixel, bin + 1)
+        From 0 to 1, but for rounding.
     n_pulses : int
     seed : int
         The same seed gives the same counts, for any number of threads.
@@ -126,7 +127,7 @@ def draw_triggers(triggered: Floats, n_pulses: int, seed: int) -> NDArray[np.uns
     if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
         add_triggers(triggered, 0, n_pulses, seed, cube)
     else:
-        chance = np.diff(triggered, axis=-1, append=1.0)
+        chance = np.clip(np.diff(triggered, axis=-1, append=1.0), 0.0, 1.0)
         cube[:] = np.random.default_rng(seed).multinomial(n_pulses, chance)[:, :-1]
     return cube
 

@@ -88,7 +88,8 @@ def draw_pulses(first, end, triggered, first_pulse, end_pulse, seed, cube):  # t
     for pixel in range(first, end):
         fired_by = np.full(n_bins + 1, np.uint64(2 * DRAWN_UNITS))
         for k in range(n_bins):
-            fired_by[k] = np.uint64(math.ceil(triggered[pixel, 1 + k] * DRAWN_UNITS))
+            within = min(max(triggered[pixel, 1 + k], 0.0), 1.0)  # rounding may lead beyond
+            fired_by[k] = np.uint64(math.ceil(within * DRAWN_UNITS))
         guide, counts = np.empty(_CELLS + 1, np.uint32), np.zeros(n_bins + 1, np.int64)
         key = pixel_key(seed, pixel)
         _draw_pixel(fired_by, first_pulse, end_pulse, key, guide, counts)

@@ -250,14 +250,14 @@ def test_the_study_has_a_row_for_each_regime_and_method(monkeypatch: pytest.Monk
     monkeypatch.setattr("core.studies.methods.calibration.REGIMES", regimes)
     monkeypatch.setattr("core.studies.methods.calibration._SIDE", 8)
     found = coverage_table(range(1))
-    assert [row[:4] for row in found.rows] == [
-        (kind, "1", "3", method)
+    assert [row[:5] for row in found.rows] == [
+        (kind, "1", "3", "0.1041", method)
         for kind in ("first", "all")
         for method in ("likelihood", "tracking")
     ]
     for row in found.rows:
-        assert 0 < row[4] <= 64
-        assert row[5].low <= row[5].value <= row[6].value <= 1
+        assert 0 < row[5] <= 64
+        assert row[6].low <= row[6].value <= row[7].value <= 1
 
 
 def test_the_flux_study_has_a_row_for_each_regime_and_bin_width(

@@ -15,6 +15,7 @@ from core.acquisition import Acquisition, Pulse
 from core.trigger import (
     coates_rate,
     draw_counts,
+    draw_triggers,
     first_difference,
     no_trigger_probability,
     rate_per_bin,
@@ -56,6 +57,13 @@ def test_draws_follow_equation_1(n_pulses: int) -> None:
         expected = 50 * n_pulses * np.append(share[seen], math.exp(-sum(of)))
         # By chance, one fixed seed in ten thousand would fall below.
         assert stats.chisquare(outcomes, expected).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("n_pulses", [500, 20_000], ids=["one by one", "multinomial"])
+def test_probabilities_may_be_rounded_beyond_0_and_1(n_pulses: int) -> None:
+    below, above = -4 * np.finfo(float).eps, 1 + 4 * np.finfo(float).eps
+    counts = draw_triggers(np.array([[0.0, below, 0.0, above, 1.0]]), n_pulses, seed=0)
+    np.testing.assert_array_equal(counts, [[0, 0, n_pulses, 0]])
 
 
 def test_draws_of_all_photons_are_poisson() -> None:

@@ -211,10 +211,12 @@ class Regime:
     detection: Detection
     sigma_bins: float
     sbr: float
+    signal: float = Flux().signal
 
     def capture(self, seed: int) -> Capture:
         """Draw a capture; of all photons, those of as many pulses are counted."""
-        acquisition, flux, rng = Acquisition(), Flux(sbr=self.sbr), np.random.default_rng(seed)
+        acquisition, rng = Acquisition(), np.random.default_rng(seed)
+        flux = Flux(self.signal, self.sbr)
         pulse = Pulse.gaussian(self.sigma_bins * acquisition.bin_width_s)
         onset = rng.uniform(0, acquisition.n_bins, (_SIDE, _SIDE))
         signal = np.full(onset.shape, flux.signal)
@@ -225,9 +227,12 @@ class Regime:
         return Capture(cube, acquisition, pulse, truth_m, detection=self.detection)
 
 
-REGIMES = tuple(
-    Regime(*each)
-    for each in product(get_args(Detection), (0.5, 1.0, 2.0, 5.0), (0.03, 0.06, 0.3, 3.0))
+REGIMES = (
+    *(
+        Regime(*each)
+        for each in product(get_args(Detection), (0.5, 1.0, 2.0, 5.0), (0.03, 0.06, 0.3, 3.0))
+    ),
+    *(Regime("first", 1.0, 3.0, signal) for signal in (1.0, 3.0, 5.0)),
 )
 
 
@@ -270,6 +275,7 @@ def coverage_table(seeds: range, processes: int = 1) -> Table:
             "detection": lambda found: found.regime.detection,
             "pulse σ, bins": lambda found: f"{found.regime.sigma_bins:g}",
             "SBR": lambda found: f"{found.regime.sbr:g}",
+            "signal": lambda found: f"{found.regime.signal:g}",
             "method": lambda found: found.method,
             "right": lambda found: found.right,
             "68 %": lambda found: found.shares[0],
