@@ -856,7 +856,7 @@ def test_files_are_ranged_inspected_read_again_or_refused(page, real_capture, tm
     expect_pixel(new, subject)
     eventually(lambda: is_mapped(new, subject.visible_m))
     go(new, "Explore")
-    new.get_by_role("button", name="Reading options").click()
+    unfold(new, "Reading options")
     bin_width = new.get_by_role("textbox", name="Bin width")  # its help is part of the name
     expect(bin_width).to_have_value("1 ns")  # a guess
     bin_width.fill("2000 ps")
