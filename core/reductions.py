@@ -22,7 +22,7 @@ from core.checks import require, require_whole
 from core.kernels.parallel import COMPILED, on_threads
 from core.kernels.streams import pixel_key, uniform_at
 from core.pulse_groups import PulseGroups
-from core.trigger import count_type
+from core.trigger import count_dtype
 
 __all__ = [
     "Reduction",
@@ -416,7 +416,7 @@ def _sum(cubes: Sequence[NDArray[np.unsignedinteger]]) -> NDArray[np.unsignedint
     """
     most = sum(int(cube.max(initial=0)) for cube in cubes)
     require("counts", most, most < 2**32, "a capture whose sums are below 2**32")
-    total: NDArray[Any] = cubes[0].astype(count_type(most))
+    total: NDArray[Any] = cubes[0].astype(count_dtype(most))
     for cube in cubes[1:]:
         total += cube.astype(total.dtype, copy=False)
     return total

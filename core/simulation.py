@@ -28,7 +28,7 @@ from core.kernels.parallel import on_threads
 from core.kernels.simulate import SHAPE_CODES, add_echo_photons, fire_once
 from core.pulse_groups import PulseGroups, group_sizes
 from core.scene import Scene, parts_of
-from core.trigger import EXPONENTIAL, add_triggers, count_type, draw_triggers, to_probability
+from core.trigger import EXPONENTIAL, add_triggers, count_dtype, draw_triggers, to_probability
 
 _Flux = TypeVar("_Flux", float, Floats)
 
@@ -83,7 +83,7 @@ def simulate(
     groups = None
     if n_groups is not None:
         groups = _draw_groups(scene, acquisition, flux, pulse, seed, n_groups)
-        cube = groups.total.astype(count_type(n_pulses))
+        cube = groups.total.astype(count_dtype(n_pulses))
     else:
         triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
         cube = draw_triggers(triggered, n_pulses, seed)
@@ -109,7 +109,7 @@ def _draw_groups(
     sizes = group_sizes(n_pulses, n_groups)
     counts = np.zeros(
         (n_groups, np.size(scene.range_m), acquisition.n_bins),
-        count_type(max(sizes)),
+        count_dtype(max(sizes)),
     )
     shifts_bins, ends = _shifts_bins(scene, acquisition, pulse), np.cumsum(sizes)
     if scene.motion is not None and scene.motion.speed_m_per_s < 0:

@@ -123,7 +123,7 @@ def draw_triggers(triggered: Floats, n_pulses: int, seed: int) -> NDArray[np.uns
     ndarray of unsigned int, shape (pixel, bin)
     """
     n_pixels, n_edges = triggered.shape
-    cube = np.zeros((n_pixels, n_edges - 1), count_type(n_pulses))
+    cube = np.zeros((n_pixels, n_edges - 1), count_dtype(n_pulses))
     if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
         add_triggers(triggered, 0, n_pulses, seed, cube)
     else:
@@ -132,9 +132,9 @@ def draw_triggers(triggered: Floats, n_pulses: int, seed: int) -> NDArray[np.uns
     return cube
 
 
-def count_type(most: int) -> type[np.unsignedinteger]:
-    """Return the smaller type for counts up to `most`."""
-    return np.uint16 if most < 2**16 else np.uint32
+def count_dtype(highest: float) -> np.dtype[np.unsignedinteger]:
+    """Return the type of a cube whose largest count is `highest`."""
+    return np.dtype(np.uint16 if highest < 2**16 else np.uint32)
 
 
 def add_triggers(

@@ -158,8 +158,9 @@ def _quantiles_bins(
     delay = _nodes(low, high, _COARSE_NODES)
     best = np.argmax(_log_density(window, delay), axis=1)[:, np.newaxis]
     at = np.take_along_axis(delay, best, axis=1)
-    window = _fitted(window, at)
-    widening = _flux_widening(window, at)
+    share = _share(window, at)
+    window = _fitted(window, share)
+    widening = _flux_widening(window, at, share)
     delay, density = _zoomed(window, low, high, widening)
     best = np.argmax(density, axis=1)[:, np.newaxis]
     dispersion = _dispersion(window, np.take_along_axis(delay, best, axis=1))
@@ -326,13 +327,13 @@ def _log_levels(window: _Window, share: Floats) -> Floats:
     return log
 
 
-def _fitted(window: _Window, delay: Floats) -> _Window:
-    """Fit each level's signal and background to each pixel, given its delay (pixel, 1).
+def _fitted(window: _Window, share: Floats) -> _Window:
+    """Fit each level's signal and background to each pixel, given `_share` (pixel, 1, bin).
 
     By Newton's method, the log likelihood of the pixel is maximised together with that of a normal
     prior, whose standard deviation is half a step between levels for both fluxes.
     """
-    p, fired, unfired = _share(window, delay)[:, 0], window.fired, window.unfired
+    p, fired, unfired = share[:, 0], window.fired, window.unfired
     signal, background = window.signal, window.background
     n_bins, precision = window.depth.size, _flux_precision(signal)
     s, b = signal, background
@@ -359,13 +360,13 @@ def _flux_precision(signal: Floats) -> Floats:
     return np.asarray(1 / (_LEVEL_ERROR * signal) ** 2)
 
 
-def _flux_widening(window: _Window, delay: Floats) -> Floats:
+def _flux_widening(window: _Window, delay: Floats, share: Floats) -> Floats:
     """Variance of a delay whose fluxes are fitted, too, over that if they were known, (pixel, 1).
 
-    By the Fisher information at delays (pixel, 1), for the likeliest level. Where an echo fires
-    nearly every pulse, a brighter one looks like an earlier one.
+    By the Fisher information at delays (pixel, 1) and their `_share`, for the likeliest level.
+    Where an echo fires nearly every pulse, a brighter one looks like an earlier one.
     """
-    share, density = _share(window, delay), np.zeros_like(window.fired)
+    density = np.zeros_like(window.fired)
     until_s = (window.edges - delay) * window.bin_width_s
     density[:, :-1] = -np.diff(window.pulse.density(until_s), axis=1) * window.bin_width_s
     level = np.argmax(_log_levels(window, share), axis=0).T

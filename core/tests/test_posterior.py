@@ -500,11 +500,14 @@ def test_without_detections_the_posterior_is_uniform(monkeypatch: pytest.MonkeyP
 
 
 def any_densities(n_levels: int, n_bins: int) -> np.ndarray:
-    """Shape (pixel, level, bin): each pixel likes one delay, and the first level likes none."""
+    """Shape (pixel, level, bin): each pixel likes one delay, and the first level likes none.
+
+    The kernel takes four pixels at a time: two are left over.
+    """
     rng = np.random.default_rng(n_bins)
-    near = np.abs(np.arange(n_bins) - rng.uniform(0, n_bins, (24, 1, 1)))
+    near = np.abs(np.arange(n_bins) - rng.uniform(0, n_bins, (26, 1, 1)))
     likely = np.exp(-near / np.linspace(1, 4, n_levels)[:, np.newaxis]) + 1e-3
-    likely[:, 0] = rng.uniform(0.01, 1.0, (24, 1))
+    likely[:, 0] = rng.uniform(0.01, 1.0, (26, 1))
     return likely.astype(np.float32)
 
 

@@ -35,10 +35,11 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import LONGEST_S, MOST_BINS, Floats
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import capture_of, count_dtype, description_of, with_guesses
+from core.io.readers.dense import capture_of, description_of, with_guesses
 from core.io.readers.guards import require_fits
 from core.io.readers.options import IN_ORDER, TRUTH_HINT, ReadOptions
 from core.io.readers.quantities import time_text
+from core.trigger import count_dtype
 
 NATIVE_BIN_S = 8e-12
 PICOSECONDS_ABOVE = 100_000

@@ -21,6 +21,7 @@ from core.io.readers.guards import require_fits
 from core.io.readers.options import IN_ORDER, TRUTH_HINT, ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
 from core.io.readers.quantities import time_text
+from core.trigger import count_dtype
 
 if TYPE_CHECKING:
     from core.inference.flux_model import FluxPrior
@@ -242,8 +243,3 @@ def require_cube(cube: NDArray[Any], name: str) -> None:
 def require_sums(shape: tuple[int, ...]) -> None:
     """Raise ``ValueError`` if the sums of a cube's pixels, of 8 bytes each, would not fit."""
     require_fits("the sums of all pixels", 8 * shape[0] * shape[1])
-
-
-def count_dtype(highest: float) -> np.dtype[np.unsignedinteger]:
-    """Return the type of a cube whose largest count is `highest`."""
-    return np.dtype(np.uint16 if highest < 2**16 else np.uint32)

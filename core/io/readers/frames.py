@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import count_dtype, dense_capture, with_guesses
+from core.io.readers.dense import dense_capture, with_guesses
 from core.io.readers.frame_guess import resembles_frames
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.options import AmbiguousError, ReadOptions
 from core.io.readers.records import chosen_records, described
 from core.pulse_groups import PulseGroups, group_sizes
+from core.trigger import count_dtype
 
 AXES = ("pulse", "row", "col")
 STRETCH = 2**20

@@ -35,7 +35,6 @@ from core.io.readers import guards
 from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import (
     LARGEST_COUNT,
-    count_dtype,
     cube_capture,
     dense_capture,
     with_guesses,
@@ -46,6 +45,7 @@ from core.io.readers.layout import completed, stated_flux, stating, timing
 from core.io.readers.maps import Map
 from core.io.readers.options import ReadOptions, choose_variable
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
+from core.trigger import count_dtype
 
 _USER_BLOCK = 512  # before the HDF5 of version 7.3
 _VERSIONS_5 = (b"\x00\x01IM", b"\x01\x00MI")
