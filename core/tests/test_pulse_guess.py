@@ -18,7 +18,6 @@ from core.estimators import estimate
 from core.io.readers.pulse_guess import (
     PulseGuess,
     guessed_pulse,
-    pairs_by_lag,
     pulse_guess,
 )
 from core.scene import Scene, scenes
@@ -233,22 +232,6 @@ def test_nothing_is_estimated_from_very_many_bins() -> None:
 def test_a_pulse_has_two_digits_or_the_width_of_a_bin() -> None:
     assert guessed_pulse(all_photons(2.0, 8, 0), 64e-12)[0] == Pulse.gaussian(130e-12)
     assert guessed_pulse(np.zeros((9, 9, 50), np.uint16), 64e-12)[0] == Pulse.gaussian(64e-12)
-
-
-def test_pairs_are_those_counted_one_by_one() -> None:
-    rows = np.random.default_rng(0).poisson(0.5, (4, 20)).astype(np.uint8)
-    # All shifts of each histogram: their mean is level, and all photons weigh the same.
-    cube = np.array([np.roll(row, shift) for row in rows for shift in range(20)])[np.newaxis]
-    expected = np.zeros(15)
-    for row in cube.reshape(-1, 20):
-        bins = np.repeat(np.arange(20), row)
-        for i, first in enumerate(bins):
-            for j, second in enumerate(bins):
-                if i != j and 0 <= second - first < 15:
-                    expected[second - first] += 1
-    pairs = pairs_by_lag(cube, 15)
-    assert pairs.shape == (32, 15)
-    np.testing.assert_allclose(pairs.sum(axis=0), expected, atol=1e-3)
 
 
 def test_large_cubes_take_little_memory() -> None:

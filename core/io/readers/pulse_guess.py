@@ -239,24 +239,6 @@ def _echo_pairs(cube: Cube, edges: NDArray[np.int64]) -> _EchoPairs:
     )
 
 
-def pairs_by_lag(cube: Cube, n_lags: int) -> Floats:
-    """Count pairs of photons of the same pixel by their gap in bins, in groups of pixels.
-
-    Parameters
-    ----------
-    cube : ndarray, shape (row, col, bin)
-        Counts.
-    n_lags : int
-        Gaps from 0 to one below this.
-
-    Returns
-    -------
-    ndarray, shape (group, lag)
-    """
-    histograms = _sample(cube, n_lags)
-    return _pairs_of_groups(histograms, np.arange(histograms.shape[0]), n_lags)
-
-
 def _sample(cube: Cube, n_lags: int) -> Cube:
     """Return evenly spread histograms, shape (pixel, bin), as many as can be transformed."""
     histograms = cube.reshape(-1, cube.shape[2])
