@@ -273,7 +273,7 @@ class Calibration(NamedTuple):
     lag_bins: float
     """`Estimator.lag_bins`."""
     least_score: float | None
-    """`Estimator.threshold`; None for no threshold."""
+    """Threshold that a score must exceed; None for no threshold."""
     kept_ties: float = 0.0
     """Share of the estimates with just this score that are kept."""
 
@@ -459,20 +459,16 @@ class Estimator:
             return None
         return self.evidence(capture, self.flux_model(capture), row, col)
 
-    def threshold(self, capture: Capture, parameters: Any, false_alarm: float) -> float:
-        """Score that a share `false_alarm` of echo-free pixels exceeds.
-
-        The scores are those of an image drawn from the background of the capture alone. Scores
-        that are counts are often equal: of those equal to the threshold, as many are kept as are
-        missing to the share (the randomized test of Neyman & Pearson 1933), by a number that
-        depends on the histogram alone (`histogram_numbers`).
-        """
-        return self._threshold(capture, parameters, false_alarm)[0]
-
     def _threshold(
         self, capture: Capture, parameters: Any, false_alarm: float
     ) -> tuple[float, float]:
-        """Return `threshold` and `Calibration.kept_ties`."""
+        """Return `Calibration.least_score` and `Calibration.kept_ties`.
+
+        A share `false_alarm` of the pixels of an image drawn from the background of the capture
+        alone have a larger score. Scores that are counts are often equal: of those equal to the
+        threshold, as many are kept as are missing to the share (the randomized test of Neyman &
+        Pearson 1933), by a number that depends on the histogram alone (`histogram_numbers`).
+        """
         cube = _null_cube(capture)
         null = Capture(cube, capture.acquisition, capture.pulse, detection=capture.detection)
         flux = self.flux_model(capture).of_pixels(null_pixels(capture))
