@@ -56,15 +56,17 @@ def test_this_machine_needs_no_token(here, host):
     assert here.socket(token_in(page), **own) == 101
 
 
-@pytest.mark.parametrize("path", PARTS)
+REBOUND = {"Host": "rebound.example.com"}
+
+
 @pytest.mark.parametrize(
-    "headers",
+    ("path", "headers"),
     [
-        {"Host": "rebound.example.com"},
-        {"Host": "127.0.0.1:1"},
-        {"Origin": "http://evil.example.com"},
-        {"Origin": "null"},
-        {"Origin": "http://localhost:1"},
+        *((path, REBOUND) for path in PARTS),
+        ("/", {"Host": "127.0.0.1:1"}),
+        ("/", {"Origin": "http://evil.example.com"}),
+        ("/", {"Origin": "null"}),
+        ("/", {"Origin": "http://localhost:1"}),
     ],
 )
 def test_requests_of_foreign_pages_and_hosts_are_refused(here, path, headers):
