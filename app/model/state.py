@@ -24,12 +24,12 @@ from core.checks import require
 from core.estimators import FALSE_ALARM, JUDGES
 from core.geometry import Box
 from core.io import RangeColors, ReadOptions
-from core.parameters import Choice, Number, Settings, check_fields, parameter
+from core.parameters import Choice, Number, Settings, parameter
 from core.reductions import Reduction
 
 
 @dataclass(frozen=True)
-class Illumination:
+class Illumination(Settings):
     """Illumination and recording of a built-in scene."""
 
     sbr: float = parameter(
@@ -53,9 +53,6 @@ class Illumination:
         Number("Seed", 0, 999, whole=True, least=0),
         "Random seed: the same seed gives the same capture.",
     )
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def flux(self) -> Flux:
@@ -149,7 +146,7 @@ class Crop(Settings):
 
 
 @dataclass(frozen=True)
-class ReductionSettings:
+class ReductionSettings(Settings):
     """Reduction of a capture: faster to process, or with more photons per pixel, but coarser."""
 
     merge: int = parameter(
@@ -194,9 +191,6 @@ class ReductionSettings:
         "Share of the pulses to use, as if the recording had ended earlier. A smaller share is a "
         "subset of a larger one.",
     )
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @classmethod
     def of(cls, reduction: Reduction, n_bins: int) -> ReductionSettings:

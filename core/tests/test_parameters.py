@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from core.estimators import ESTIMATORS
-from core.parameters import Choice, Number, check_fields, parameter, spec_of
+from core.parameters import Choice, Number, Settings, parameter, spec_of
 from core.tracking import PRESETS, TrackingParameters
 
 FIELDS = [
@@ -21,14 +21,11 @@ FIELDS = [
 
 
 @dataclass(frozen=True)
-class Settings:
+class Example(Settings):
     width: float = parameter(2.0, Number("w", 1.0, 4.0, least=0.0, open_below=True), "Width.")
     count: int = parameter(3, Number("c", 0, 9, whole=True, least=0), "Count.")
     way: str = parameter("up", Choice("Way", ("up", "down")), "Way.")
     level: float = parameter(0.0, Number("v", -1.0, 1.0), "Any number.")
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +43,7 @@ class Settings:
 )
 def test_sensible_values_are_accepted(accepted: dict[str, Any]) -> None:
     (name,) = accepted
-    assert getattr(Settings(**accepted), name) == accepted[name]
+    assert getattr(Example(**accepted), name) == accepted[name]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +67,7 @@ def test_sensible_values_are_accepted(accepted: dict[str, Any]) -> None:
 def test_the_rest_is_refused_in_words(refused: dict[str, Any], what: str) -> None:
     ((name, value),) = refused.items()
     with pytest.raises(ValueError, match="is not accepted") as error:
-        Settings(**refused)
+        Example(**refused)
     assert f"{name} = {value!r} is not accepted: give {what}" in str(error.value)
 
 

@@ -17,11 +17,11 @@ from app.pages.paper import text
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, Gallery, TableCard
-from app.pages.shared.section import Checked, Repetitions, Settings, SettingsSection, StudySection
+from app.pages.shared.section import AnySettings, Repetitions, SettingsSection, StudySection
 from app.tasks.scheduler import Step
 from app.widgets.controls import Sentence
 from core import PRESETS, Flux
-from core.parameters import Choice, Number, parameter
+from core.parameters import Choice, Number, Settings, parameter
 from core.studies import outputs
 from core.studies.paper import figures as paper
 from core.studies.paper import pile_up as figures_5_6
@@ -53,7 +53,7 @@ _ECHO = Number("Bin of the echo", 20, 99, whole=True, least=0, most=99)
 
 
 @dataclass(frozen=True)
-class Jump(Checked):
+class Jump(Settings):
     """Settings of Figures 1 and 2."""
 
     onset_bin: int = parameter(50, _ECHO, "Where the echo begins: 50 in the paper.")
@@ -66,7 +66,7 @@ class Jump(Checked):
 
 
 @dataclass(frozen=True)
-class Scales(Checked):
+class Scales(Settings):
     """Settings of Figure 4."""
 
     onset_bin: int = parameter(50, _ECHO, "Bin of the target: 20, 50 and 90 in Figure 4.")
@@ -80,7 +80,7 @@ class Scales(Checked):
 
 
 @dataclass(frozen=True)
-class Weights(Checked):
+class Weights(Settings):
     """Settings of the weights."""
 
     onset_bin: int = parameter(80, _ECHO, "Bin of the target.")
@@ -95,7 +95,7 @@ class RepeatedAt(Repetitions):
 
 
 @dataclass(frozen=True)
-class Images(Checked):
+class Images(Settings):
     """Settings of the range images."""
 
     figure: str = parameter(
@@ -108,7 +108,7 @@ class Images(Checked):
 
 
 @dataclass(frozen=True)
-class AtSBR(Checked):
+class AtSBR(Settings):
     """Settings of sections in which only the SBR varies."""
 
     sbr: float = parameter(0.06, _SBR, _SBR_HELP)
@@ -225,7 +225,7 @@ def plan_3(settings: RepeatedAt) -> Plan:
 # Sections
 
 
-class PaperSection(SettingsSection[Settings]):
+class PaperSection(SettingsSection[AnySettings]):
     """A section of this page: its files are named after the paper and the settings."""
 
     def about(self) -> Subject:
@@ -233,13 +233,13 @@ class PaperSection(SettingsSection[Settings]):
         return Subject("paper", "", (self.settings,))
 
 
-class LiveFigures(PaperSection[Settings]):
+class LiveFigures(PaperSection[AnySettings]):
     """Figures that follow their settings at once, one below the other on a common axis.
 
     Parameters
     ----------
     session : Session
-    settings : Checked
+    settings : Settings
         Initial settings.
     explanation : str
         Text above the controls.
@@ -257,9 +257,9 @@ class LiveFigures(PaperSection[Settings]):
     def __init__(
         self,
         session: Session,
-        settings: Settings,
+        settings: AnySettings,
         explanation: str,
-        compute: Callable[[Settings], Sequence[outputs.Plot]],
+        compute: Callable[[AnySettings], Sequence[outputs.Plot]],
         count: int,
     ) -> None:
         super().__init__(session, settings, explanation)
@@ -276,7 +276,7 @@ class LiveFigures(PaperSection[Settings]):
         """Return the figures, and their controls."""
         return _stack(*self.cards), self.controls()
 
-    def change(self, settings: Settings) -> None:
+    def change(self, settings: AnySettings) -> None:
         """Compute the figures for other settings."""
         super().change(settings)
         self._jobs.submit(partial(self._compute, settings), self._draw, self.report_error)
@@ -289,13 +289,13 @@ class LiveFigures(PaperSection[Settings]):
         self.shown = plots
 
 
-class RepeatedTable(PaperSection[Settings], StudySection[Settings]):
+class RepeatedTable(PaperSection[AnySettings], StudySection[AnySettings]):
     """A table over repetitions that is refined with each of them.
 
     Parameters
     ----------
     session : Session
-    settings : Checked
+    settings : Settings
         Initial settings, with a field `repetitions`.
     explanation : str
         Text above the controls.
@@ -313,10 +313,10 @@ class RepeatedTable(PaperSection[Settings], StudySection[Settings]):
     def __init__(
         self,
         session: Session,
-        settings: Settings,
+        settings: AnySettings,
         explanation: str,
-        plan: Callable[[Settings], Plan],
-        table: Callable[[Results, Settings], outputs.Table],
+        plan: Callable[[AnySettings], Plan],
+        table: Callable[[Results, AnySettings], outputs.Table],
     ) -> None:
         super().__init__(session, settings, explanation, "repetitions")
         self._plan, self._table = plan, table
@@ -336,7 +336,7 @@ class RepeatedTable(PaperSection[Settings], StudySection[Settings]):
         draw = partial(self._draw, settings, results)
         return [Step(partial(trials, plan, [seed]), draw) for seed in range(settings.repetitions)]
 
-    def _draw(self, settings: Settings, results: Results, new: Results) -> None:
+    def _draw(self, settings: AnySettings, results: Results, new: Results) -> None:
         for key, scores in new.items():
             results.setdefault(key, []).extend(scores)
         count = len(next(iter(results.values())))

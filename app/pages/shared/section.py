@@ -30,7 +30,7 @@ from app.tasks.scheduler import Lane, Latest, Step
 from app.theme import Palette, palette
 from app.widgets.controls import Facts, SettingsPanel, Table
 from app.widgets.figures import Layers
-from core.parameters import Number, check_fields, parameter
+from core.parameters import Number, Settings, parameter
 
 Result = TypeVar("Result")
 
@@ -42,19 +42,11 @@ class Paintable(Protocol):
         """Take on the colours of a mode."""
 
 
-@dataclass(frozen=True)
-class Checked:
-    """Base of settings whose fields, made by `core.parameters.parameter`, are validated."""
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-
-Settings = TypeVar("Settings", bound=Checked)
+AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 @dataclass(frozen=True)
-class Repetitions(Checked):
+class Repetitions(Settings):
     """Amount of simulation."""
 
     repetitions: int = parameter(
@@ -193,31 +185,31 @@ class Section(ABC):
         return shown_with(self.offer(below(table), "table", show, TABLE), table, "rows")
 
 
-class SettingsSection(Section, Generic[Settings]):
+class SettingsSection(Section, Generic[AnySettings]):
     """A section with settings of its own.
 
     Parameters
     ----------
     session : Session
-    settings : Checked
+    settings : Settings
         Initial settings.
     explanation : str
         Text above the controls.
 
     Attributes
     ----------
-    settings : Checked
+    settings : Settings
         The present settings.
     panel : SettingsPanel
     """
 
-    def __init__(self, session: Session, settings: Settings, explanation: str = "") -> None:
+    def __init__(self, session: Session, settings: AnySettings, explanation: str = "") -> None:
         super().__init__(session)
         self.settings = settings
         self.panel = SettingsPanel(settings, self.change)
         self._explanation = explanation
 
-    def change(self, settings: Settings) -> None:
+    def change(self, settings: AnySettings) -> None:
         """Take other settings."""
         self.settings = settings
 
@@ -226,13 +218,13 @@ class SettingsSection(Section, Generic[Settings]):
         return aside(self._explanation, self.panel.layout, *more)
 
 
-class StudySection(SettingsSection[Settings]):
+class StudySection(SettingsSection[AnySettings]):
     """A section whose content is a study in steps, started when it first comes on screen.
 
     Parameters
     ----------
     session : Session
-    settings : Checked
+    settings : Settings
         Initial settings.
     explanation : str
         Text above the controls.
@@ -240,7 +232,9 @@ class StudySection(SettingsSection[Settings]):
         Name of the steps.
     """
 
-    def __init__(self, session: Session, settings: Settings, explanation: str, noun: str) -> None:
+    def __init__(
+        self, session: Session, settings: AnySettings, explanation: str, noun: str
+    ) -> None:
         super().__init__(session, settings, explanation)
         self.study = Study(session, self.steps, noun)
 

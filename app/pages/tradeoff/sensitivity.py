@@ -12,11 +12,11 @@ from app.model.methods import METHOD_TITLES
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, TableCard
-from app.pages.shared.section import Checked, StudySection
+from app.pages.shared.section import StudySection
 from app.pages.tradeoff import text
 from app.tasks.scheduler import Step
 from app.widgets.cards import part
-from core.parameters import Choice, Number, parameter
+from core.parameters import Choice, Number, Settings, parameter
 from core.studies.sensitivity import (
     Sweep,
     along,
@@ -39,7 +39,7 @@ ROW_PX = 338
 
 
 @dataclass(frozen=True)
-class Swept(Checked):
+class Swept(Settings):
     """The method whose settings are swept."""
 
     method: str = parameter(

@@ -20,7 +20,7 @@ from app.model.store import Answer, Request, same_capture
 from app.pages.session import Session
 from app.pages.shared.downloads import TABLE, Shown, Subject, below, looked_at
 from app.pages.shared.outputs import layers_of, spelled
-from app.pages.shared.section import Checked, Repetitions, SettingsSection
+from app.pages.shared.section import Repetitions, SettingsSection
 from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import text
 from app.plots import elements as plots
@@ -31,7 +31,7 @@ from app.widgets.controls import Sentence, SettingsPanel, Table
 from app.widgets.figures import paint_frame, pane_of
 from core.cost import predicted
 from core.metrics import Interval
-from core.parameters import Choice, Number, parameter
+from core.parameters import Choice, Number, Settings, parameter
 from core.studies.tradeoff import (
     Candidate,
     Point,
@@ -66,7 +66,7 @@ class Effort(Repetitions):
 
 
 @dataclass(frozen=True)
-class Goal(Checked):
+class Goal(Settings):
     """Targets that a configuration has to reach."""
 
     milliseconds: float = parameter(
