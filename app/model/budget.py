@@ -29,6 +29,9 @@ SERVER_REQUESTS = 4
 FREE_BYTES = 2**26
 """Requests below this size are not counted and never wait."""
 
+MOST_FACTOR = 8
+"""Largest factor by which `fitting` merges bins, or skips rows and columns."""
+
 REMEDY = (
     "Crop the gate, merge bins or keep fewer pixels under Data reduction; or range all of it "
     "without this page: python -m core estimate"
@@ -121,7 +124,6 @@ def fitting(
     shape: tuple[int, int, int],
     cost: Callable[[tuple[int, int, int]], Cost],
     least: Reduction,
-    most: int = 8,
 ) -> tuple[int, int] | None:
     """Find the weakest merging of bins and skipping of pixels with which a capture fits.
 
@@ -133,15 +135,13 @@ def fitting(
         Predicts the cost of an estimate of a capture of a shape.
     least : Reduction
         Reduction that is applied in any case.
-    most : int
-        Largest factor of either.
 
     Returns
     -------
     tuple of int
         ``merge`` and ``skip``; None where no reduction is strong enough.
     """
-    factors = product(range(least.merge, most + 1), range(least.skip, most + 1))
+    factors = product(range(least.merge, MOST_FACTOR + 1), range(least.skip, MOST_FACTOR + 1))
     for merge, skip in sorted(factors, key=lambda each: (each[0] * each[1] ** 2, each[1])):
         reduction = replace(least, merge=merge, skip=skip)
         if reduction.fits(shape) and fits(cost(reduction.shape(shape))):

@@ -12,6 +12,7 @@ const LABEL_LETTER_PX = 6 // width of an average letter of a label
 const BOX_INK = 0.25 // share of the text colour in the lines of the box
 const CLICK_MOVE_PX = 4 // a press that moves less than this is a click, not a drag
 const PICK_PX = 12
+const POINT_SIZE = 1.4 // diameter over the distance between neighbouring points
 const KEY_TURN = Math.PI / 36
 const KEY_ZOOM = 1.15
 const CAMERA_EVENT = "firstphoton:camera" // a linked camera has moved
@@ -537,8 +538,7 @@ class CloudView {
 
   /* Diameter in CSS pixels of a point at a depth of 1 m. */
   pointScale(height) {
-    const {point_size: size, spacing_m: spacing} = this.model
-    return (size * spacing * height) / (2 * HALF_VIEW)
+    return (POINT_SIZE * this.model.spacing_m * height) / (2 * HALF_VIEW)
   }
 
   sizePoints(height) {
@@ -764,7 +764,7 @@ export function render({model}) {
   model.on(["ink", "paper", "wrong_color"], () => view.mark("look"))
   model.on(["positions", "colors", "pixels", "wrong"], () => view.mark("data"))
   model.on(["selected", "pinned"], () => view.mark("selected"))
-  model.on(["point_size", "spacing_m"], () => view.schedule())
+  model.on("spacing_m", () => view.schedule())
   model.on("bounds", () => view.mark("box"))
   model.on(["scene_id", "home"], () => view.mark("home"))
   model.on("remove", () => view.delete())

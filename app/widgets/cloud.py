@@ -37,11 +37,6 @@ class PointCloud(Component):
         doc="Index of the pixel marked by a ring, -1 for none; a click on a point sets it.",
     )
     pinned = param.List(default=[], item_type=int, doc="Indices of further pixels with a ring.")
-    point_size = param.Number(
-        default=1.4,
-        bounds=(0.2, 5.0),
-        doc="Diameter of a point as a multiple of the distance between neighbouring points.",
-    )
     spacing_m = param.Number(default=0.0, doc="Distance between neighbouring points in metres.")
     bounds = param.List(
         default=[],

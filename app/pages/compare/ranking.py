@@ -133,12 +133,12 @@ def reference_of(capture: Capture) -> Reference:
         )
 
 
-def agreement(image: RangeImage, other: RangeImage, tolerance_bins: float = 3.0) -> float:
-    """Share of the estimates of another image with which one agrees; NaN without any.
+def agreement(image: RangeImage, other: RangeImage) -> float:
+    """Share of the estimates of another image with which one agrees in 3 bins; NaN without any.
 
     A pixel in which only the other has an estimate counts as disagreement.
     """
-    close = (np.abs(image.bin - other.bin) <= tolerance_bins)[other.valid]
+    close = (np.abs(image.bin - other.bin) <= TOLERANCES_BINS[-1])[other.valid]
     return float(close.mean()) if close.size else float("nan")
 
 

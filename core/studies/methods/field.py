@@ -87,10 +87,10 @@ def wall_pulse(folder: Path, truth: Face) -> Pulse:
     return Pulse.measured(echo[around[0] : around[-1] + 1], bin_width_s=NATIVE_BIN_S)
 
 
-def with_background(capture: Capture, sbr: float, seed: int = 0) -> Capture:
+def with_background(capture: Capture, sbr: float) -> Capture:
     """Add uniform background, taking the capture's own photons for signal."""
     rate = capture.counts.mean() / sbr / capture.acquisition.n_bins
-    added = np.random.default_rng(seed).poisson(rate, capture.cube.shape).astype(np.uint16)
+    added = np.random.default_rng(0).poisson(rate, capture.cube.shape).astype(np.uint16)
     return replace(capture, cube=capture.cube + added, source=f"{capture.source}; SBR {sbr:g}")
 
 

@@ -33,11 +33,11 @@ _NEAR_BINS = 2.0
 _PHOTONS = 20.0  # signal of a pixel that counts all photons
 
 
-def tailed_pulse(tail: float = 0.1) -> Pulse:
-    """Return a Gaussian of 2.8 bins at half maximum, of whose photons a share forms a long tail."""
+def tailed_pulse() -> Pulse:
+    """Return a Gaussian of 2.8 bins at half maximum, a tenth of whose photons form a long tail."""
     time = np.arange(60)
     peak, decay = np.exp(-0.5 * ((time - 8) / 3) ** 2), np.exp(-time / 12) * (time > 8)
-    samples = (1 - tail) * peak / peak.sum() + tail * decay / decay.sum()
+    samples = 0.9 * peak / peak.sum() + 0.1 * decay / decay.sum()
     return Pulse.measured(samples, 0.4e-9)
 
 

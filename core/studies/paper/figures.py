@@ -52,6 +52,7 @@ FIGURE_4 = Flux(sbr=0.08)
 N_PULSES = 1000
 GATE = Acquisition(n_pulses=N_PULSES)
 PULSE = Pulse()
+SEED = 0
 NEAR = {sbr: Condition("car", sbr) for sbr in TABLE_2}
 FAR = Condition("building", 0.038, 0.13)
 BINS = np.arange(GATE.n_bins, dtype=float) + 0.5
@@ -118,16 +119,9 @@ def figure_2(flux: Flux = FIGURE_1, onset_bin: float = 50.0) -> Plot:
     )
 
 
-def figure_4(
-    parameters: TrackingParameters = PRESETS["recommended"],
-    onsets_bin: Sequence[float] = (20.0, 50.0, 90.0),
-    seed: int = 0,
-) -> list[Plot]:
+def figure_4() -> list[Plot]:
     """Plot histogram and both scales for a near, a middle and a far target."""
-    return [
-        pixel_signals(onset, parameters, Flux(sbr=0.08), f"figure_4_bin_{onset:g}", seed)
-        for onset in onsets_bin
-    ]
+    return [pixel_signals(onset, key=f"figure_4_bin_{onset:g}") for onset in (20.0, 50.0, 90.0)]
 
 
 def pixel_signals(
@@ -135,7 +129,7 @@ def pixel_signals(
     parameters: TrackingParameters = PRESETS["recommended"],
     flux: Flux = FIGURE_4,
     key: str = "pixel_signals",
-    seed: int = 0,
+    seed: int = SEED,
 ) -> Plot:
     """Plot histogram and signals of a pixel with the target at one bin, or with none at NaN."""
     scene = Scene(np.full((1, 1), GATE.bin_to_range_m(onset_bin)))
@@ -187,10 +181,10 @@ def residual_by_place(
     )
 
 
-def weights(flux: Flux = FIGURE_4, onset_bin: float = 80.0, seed: int = 0) -> Plot:
+def weights(flux: Flux = FIGURE_4, onset_bin: float = 80.0) -> Plot:
     """Plot one pixel's residual under each weight, every curve over its maximum."""
     scene = Scene(np.full((1, 1), GATE.bin_to_range_m(onset_bin)))
-    histogram = simulate(scene, GATE, flux, PULSE, seed).cube[0, 0]
+    histogram = simulate(scene, GATE, flux, PULSE, SEED).cube[0, 0]
     curves = {}
     for weight, alpha in (("none", 1.0), ("cubic", 1.0), ("exponential", 3.0), ("survival", 1.0)):
         parameters = TrackingParameters(weight=weight, alpha=alpha)  # type: ignore[arg-type]
@@ -208,9 +202,9 @@ def weights(flux: Flux = FIGURE_4, onset_bin: float = 80.0, seed: int = 0) -> Pl
     )
 
 
-def field_pixel(seed: int = 0) -> Plot:
+def field_pixel() -> Plot:
     """Plot one pixel of the simulated twin of the field experiment."""
-    capture = FAR.capture(seed)
+    capture = FAR.capture(SEED)
     row, col = (size // 2 for size in capture.shape)
     signals = tracking_signals(capture.cube[row, col], PRESETS["recommended"])
     truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m)[row, col])
@@ -229,32 +223,32 @@ def field_pixel(seed: int = 0) -> Plot:
 # -- Figures of range images -----------------------------------------------------------------------
 
 
-def figure_8(seed: int = 0) -> Pictures:
+def figure_8() -> Pictures:
     """Show the car at the six SBRs, by the recommended preset."""
     images = {"truth": scenes["car"]().range_m}
     for sbr, condition in NEAR.items():
-        images[f"SBR {sbr:g}"] = _range_image(condition.capture(seed), RECOMMENDED)
+        images[f"SBR {sbr:g}"] = _range_image(condition.capture(SEED), RECOMMENDED)
     return _pictures("figure_8", "Figure 8: the car under six SBRs", images)
 
 
-def figure_9(sbr: float = 0.06, seed: int = 0) -> Pictures:
+def figure_9(sbr: float = 0.06) -> Pictures:
     """Show the car by every method the paper compares, at one SBR."""
-    capture = Condition("car", sbr).capture(seed)
+    capture = Condition("car", sbr).capture(SEED)
     images = {"truth": np.asarray(capture.truth_range_m), **_by_method(capture, TABLE_3)}
     return _pictures("figure_9", f"Figure 9: the methods at SBR {sbr:g}", images)
 
 
-def figure_11(seed: int = 0) -> Pictures:
+def figure_11() -> Pictures:
     """Show the paper's reference of the field experiment: its method without background."""
     scene = scenes["building"]()
-    night = simulate(scene, scene.acquisition, Flux(FAR.signal, math.inf), PULSE, seed)
+    night = simulate(scene, scene.acquisition, Flux(FAR.signal, math.inf), PULSE, SEED)
     images = {"truth": scene.range_m, "tracking, no background": _range_image(night, RECOMMENDED)}
     return _pictures("figure_11", "Figure 11, simulated twin: the reference image", images)
 
 
-def figure_12(seed: int = 0) -> Pictures:
+def figure_12() -> Pictures:
     """Show the simulated twin of the field experiment by every method the paper compares."""
-    capture = FAR.capture(seed)
+    capture = FAR.capture(SEED)
     images = {"truth": np.asarray(capture.truth_range_m), **_by_method(capture, TABLE_5)}
     return _pictures("figure_12", "Figure 12, simulated twin: the building", images)
 
@@ -354,9 +348,9 @@ def _methods_table(
 # -- What the paper does not report ----------------------------------------------------------------
 
 
-def limits(seed: int = 0) -> Table:
+def limits() -> Table:
     """Return the limits of a single pixel at each SBR, mean over the target pixels."""
-    found = [(each, limit(each.capture(seed))) for each in (*NEAR.values(), FAR)]
+    found = [(each, limit(each.capture(SEED))) for each in (*NEAR.values(), FAR)]
 
     def right(row: tuple[Condition, Limit]) -> float:
         return float(np.nanmean(row[1].right_bin_probability))
@@ -417,9 +411,9 @@ def arithmetic() -> Table:
     )
 
 
-def echo_free(sbr: float = 0.06, size: int = 64, seed: int = 0) -> Plot:
+def echo_free(sbr: float = 0.06, size: int = 64) -> Plot:
     """Plot where each method's estimates lie in pixels without echo."""
-    capture = simulate(Scene(np.full((size, size), np.nan)), GATE, Flux(sbr=sbr), PULSE, seed)
+    capture = simulate(Scene(np.full((size, size), np.nan)), GATE, Flux(sbr=sbr), PULSE, SEED)
     edges = np.arange(0, GATE.n_bins + 1, 5)
     curves = {}
     for method in COMPARED:
@@ -438,12 +432,10 @@ def echo_free(sbr: float = 0.06, size: int = 64, seed: int = 0) -> Plot:
     )
 
 
-def by_place(
-    sbr: float = 0.06, size: int = 64, onset: Sequence[float] = PLACES, seed: int = 0
-) -> Plot:
+def by_place(sbr: float = 0.06, size: int = 64, onset: Sequence[float] = PLACES) -> Plot:
     """Plot the restoration degree against the position of the echo, equal in all pixels."""
     flux, onset_bin = Flux(sbr=sbr), np.asarray(onset, dtype=float)
-    found = found_by_place(GATE, flux, COMPARED, onset, size, seed)
+    found = found_by_place(GATE, flux, COMPARED, onset, size, SEED)
     bound = right_bin_probability(onset_bin, flux.signal, flux.background, PULSE, GATE)
     chance = 1.96 * math.sqrt(0.25 / size**2)
     return Plot(

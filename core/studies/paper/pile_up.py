@@ -24,9 +24,9 @@ LEAST_P = 0.05
 _N_NOISE = 19  # bins at the front of the gate whose mean is Figure 5b
 
 
-def figure_5b(flux: Flux, seed: int = 0) -> Plot:
+def figure_5b(flux: Flux) -> Plot:
     """Plot the mean trigger frequency of the noise before the target, against the target's bin."""
-    frequency, expected = _frequencies(flux, seed)
+    frequency, expected = _frequencies(flux)
     noise, mean = (each[:, :_N_NOISE].mean(axis=1) for each in (frequency, expected))
     # Bins of one pulse exclude each other, so that their sum is binomial, too.
     total = mean * _N_NOISE
@@ -43,14 +43,14 @@ def figure_5b(flux: Flux, seed: int = 0) -> Plot:
     )
 
 
-def figure_6(flux: Flux, seed: int = 0) -> Plot:
+def figure_6(flux: Flux) -> Plot:
     """Plot the trigger frequency at the target's peak against its bin, and fits of this curve.
 
     The paper fits an exponential, concludes that the weight should grow exponentially, and prints
     the cubic weight of Eq. 13, whose reciprocal is also fitted here. By Eq. 1 the peak falls
     with the probability that a pulse is still armed, which is exponential in the target's bin.
     """
-    frequency, expected = _frequencies(flux, seed)
+    frequency, expected = _frequencies(flux)
     share = Pulse().bin_probability(ONSETS.astype(float), GATE.n_bins, GATE.bin_width_s)
     at_peak = np.arange(ONSETS.size), share.argmax(axis=1)
     peak, mean = frequency[at_peak], expected[at_peak]
@@ -78,10 +78,10 @@ def figure_6(flux: Flux, seed: int = 0) -> Plot:
     )
 
 
-def _frequencies(flux: Flux, seed: int) -> tuple[Floats, Floats]:
+def _frequencies(flux: Flux) -> tuple[Floats, Floats]:
     """Return simulated and expected trigger frequencies (target, bin), a target at each bin."""
     scene = Scene(GATE.bin_to_range_m(ONSETS[np.newaxis].astype(float)))
-    counts = simulate(scene, GATE, flux, Pulse(), seed).cube[0]
+    counts = simulate(scene, GATE, flux, Pulse(), seed=0).cube[0]
     rate = rate_per_bin(ONSETS.astype(float), flux.signal, flux.background, Pulse(), GATE)
     return counts / N_PULSES, trigger_probability(rate)
 

@@ -102,11 +102,12 @@ def theory(simulation: Simulation) -> float:
     )
 
 
-def exposure(simulation: Simulation, most: float = EXPOSURES[-1]) -> float:
-    """Return the most informative factor on the flux, up to `most` (`core.limits.best_exposure`).
+def exposure(simulation: Simulation) -> float:
+    """Return the most informative factor on the flux, at most the largest of `EXPOSURES`.
 
-    It is the median over (a sample of) the targets.
+    It is the median of `core.limits.best_exposure` over (a sample of) the targets.
     """
+    most: float = EXPOSURES[-1]
     (brightest,) = over_exposures(simulation, [most])
     onset, signal = _targets(brightest)
     background, pulse = brightest.flux.background, brightest.pulse
