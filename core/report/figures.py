@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -20,11 +19,10 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
 from core.io.writers.colors import ColorScale
-from core.io.writers.picture import DRAWING
+from core.io.writers.picture import drawing, save_figure
 
 _INK = "#010203"  # replaced by the colour of the page's text
 _STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",
     "font.size": 10.0,
     "axes.facecolor": "none",
     "figure.facecolor": "none",
@@ -129,20 +127,18 @@ def _draw_mark(axes: Axes, name: str, mark: Mark) -> None:
         axes.axvspan(mark.low_m, mark.high_m, color=mark.color, alpha=0.2, lw=0, label=name)
 
 
-@contextmanager
-def _style(title: str) -> Iterator[None]:
-    """Set Matplotlib's parameters, which all threads share, for one plot.
+def _style(title: str) -> AbstractContextManager[None]:
+    """Draw a plot of the report.
 
     The title enters the identifiers within the plot, which must differ on a page.
     """
-    with DRAWING, matplotlib.rc_context({**_STYLE, "svg.hashsalt": title}):
-        yield
+    return drawing({**_STYLE, "svg.hashsalt": title})
 
 
 def _svg(figure: Figure) -> str:
-    """Return a figure as an element of the page, the same text for the same data."""
+    """Return a figure as an element of the page."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", dpi=200, metadata={"Date": None, "Creator": None})
+    save_figure(figure, buffer, "svg", 200)
     drawn = buffer.getvalue().decode()
     drawn = drawn[drawn.index("<svg") :].replace(_INK, "currentColor")
     # A style would hold for the whole page, and names of groups are those of every plot.

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
@@ -19,6 +18,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from core.io import OUTSIDE_COLOR, RangeColors, colors_of
+from core.io.writers.picture import drawing, save_figure
 from core.metrics import Interval
 from core.studies.outputs import (
     Item,
@@ -82,13 +82,14 @@ def write(items: Sequence[Item], folder: Path, title: str, introduction: Sequenc
         if isinstance(item, Table):
             parts.append(_html_table(item))
         else:
-            figure = _drawn(item)
-            _lay_out(figure)
-            png = _saved(figure, "png")
-            (folder / f"{item.key}.png").write_bytes(png)
-            if not isinstance(item, Pictures):
-                (folder / f"{item.key}.svg").write_bytes(_saved(figure, "svg"))
-            source = f"data:image/png;base64,{b64encode(png).decode()}"
+            kinds = ("png",) if isinstance(item, Pictures) else ("png", "svg")
+            with drawing():
+                figure = _drawn(item)
+                _lay_out(figure)
+                images = {kind: _saved(figure, kind) for kind in kinds}
+            for kind, image in images.items():
+                (folder / f"{item.key}.{kind}").write_bytes(image)
+            source = f"data:image/png;base64,{b64encode(images['png']).decode()}"
             parts.append(f'<figure><img src="{source}" alt="{html.escape(item.title)}"></figure>')
         if item.note:
             parts.append(f'<p class="note">{html.escape(item.note)}</p>')
@@ -102,18 +103,20 @@ def picture(item: Plot | Pictures | Pulses, is_blank: bool = False) -> str:
 
     With `is_blank`, axes alone are drawn, to sketch on; of pulses, also the photons.
     """
-    figure = _drawn(item)
-    if isinstance(item, Plot):
-        figure.set_size_inches(_PRINTED_INCHES)
-        low, _ = figure.axes[0].get_ylim()
-        figure.axes[0].set_ylim(bottom=min(low, 0.0))  # so that a constant does not fill the axis
-    if is_blank:
-        _erase(figure)
-        if isinstance(item, Pulses):
-            figure.axes[-1].set_ylim(0, _COUNTED)
-    _lay_out(figure)
     kind, media = ("png", "png") if isinstance(item, Pictures) else ("svg", "svg+xml")
-    return f"data:image/{media};base64,{b64encode(_saved(figure, kind)).decode()}"
+    with drawing():
+        figure = _drawn(item)
+        if isinstance(item, Plot):
+            figure.set_size_inches(_PRINTED_INCHES)
+            low, _ = figure.axes[0].get_ylim()
+            figure.axes[0].set_ylim(bottom=min(low, 0.0))  # a constant does not fill the axis
+        if is_blank:
+            _erase(figure)
+            if isinstance(item, Pulses):
+                figure.axes[-1].set_ylim(0, _COUNTED)
+        _lay_out(figure)
+        image = _saved(figure, kind)
+    return f"data:image/{media};base64,{b64encode(image).decode()}"
 
 
 def _erase(figure: Figure) -> None:
@@ -155,12 +158,9 @@ def _lay_out(figure: Figure) -> None:
     figure.set_layout_engine("none")
 
 
-def _saved(figure: Figure, format: str) -> bytes:
-    """Return the same bytes for the same data: no date, stable identifiers."""
+def _saved(figure: Figure, kind: str) -> bytes:
     buffer = io.BytesIO()
-    metadata = {"png": {"Software": None}, "svg": {"Date": None, "Creator": "firstphoton"}}
-    with rc_context({"svg.hashsalt": "firstphoton", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format=format, dpi=110, metadata=metadata[format])
+    save_figure(figure, buffer, kind, 110, "firstphoton")
     return buffer.getvalue()
 
 

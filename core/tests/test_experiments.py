@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy import stats
 
 from core import metrics
@@ -23,6 +24,7 @@ from core.estimators import ESTIMATORS, estimate
 from core.inference.limits import right_bin_probability
 from core.inspection import CONFIDENT
 from core.inspection.maps import likeliest
+from core.io.writers.picture import DRAWING
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies import range_prior, trials
@@ -40,7 +42,7 @@ from core.studies.outputs import (
 from core.studies.paper import figures as paper
 from core.studies.paper import page, pile_up, recommend
 from core.studies.paper.printed import TABLE_2, TABLE_3, TABLE_5
-from core.studies.report import write
+from core.studies.report import picture, write
 from core.studies.trials import Condition, Method, Results, Score, summary
 from core.tracking import PRESETS, TrackingParameters
 
@@ -440,6 +442,23 @@ def test_scatter_plots_and_bands_are_written_with_their_intervals(tmp_path: Path
     assert files["curve.csv"].decode().splitlines()[1] == "1.0,1.0,0.0,2.0"
     write([scatter, plot], tmp_path, "once", ())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
+
+
+def test_figures_are_drawn_by_one_thread_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Matplotlib's settings are those of the process: a report sets others."""
+    drawn, draw = [], Figure.add_subplot
+
+    def watched(figure: Figure, *arguments: Any) -> Any:
+        drawn.append(DRAWING.locked())
+        return draw(figure, *arguments)
+
+    monkeypatch.setattr(Figure, "add_subplot", watched)
+    plot = paper.figure_1()
+    write([plot], tmp_path, "once", ())
+    picture(plot)
+    assert drawn == [True, True] and not DRAWING.locked()
 
 
 # -- Calibration -----------------------------------------------------------------------------------

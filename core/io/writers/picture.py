@@ -6,7 +6,8 @@ the acquisition, method, settings (JSON), version and source, one line ``name: v
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Lock
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -26,7 +27,35 @@ _DOTS_PER_INCH = 200
 _WIDTH_INCHES = 6.4  # 1280 pixels
 
 DRAWING = Lock()
-"""Matplotlib's settings are those of the process: one thread draws at a time."""
+"""Held while a figure is drawn and saved."""
+
+
+@contextmanager
+def drawing(settings: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Draw and save a figure with settings of Matplotlib, in one thread at a time.
+
+    The settings are those of the process. By default, the text of an SVG stays text, and its
+    identifiers are the same each time.
+    """
+    import matplotlib  # noqa: PLC0415 - slow to import
+
+    chosen: dict[Any, Any] = {"svg.hashsalt": "firstphoton", "svg.fonttype": "none"}
+    with DRAWING, matplotlib.rc_context(chosen | dict(settings or {})):
+        yield
+
+
+def save_figure(
+    figure: Figure,
+    file: BinaryIO,
+    suffix: str,
+    dpi: int,
+    creator: str | None = None,
+    description: str | None = None,
+) -> None:
+    """Save a figure as ``"png"`` or ``"svg"``, without a date: the same bytes for the same data."""
+    known: dict[str, Any] = {"Description": description}
+    known |= {"Date": None, "Creator": creator} if suffix == "svg" else {"Software": creator}
+    figure.savefig(file, format=suffix, dpi=dpi, metadata=known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +107,9 @@ class Picture:
 
     def write(self, file: BinaryIO, suffix: str) -> None:
         """Write the picture as ``"png"`` or ``"svg"``; the text of an SVG stays text."""
-        import matplotlib  # noqa: PLC0415 - slow to import
-
-        known: dict[str, Any] = {"Description": "\n".join(self.lines)}
-        known |= {"Date": None, "Creator": software()} if suffix == "svg" else {}
-        known |= {"Software": software()} if suffix == "png" else {}
-        # The salt makes the identifiers within an SVG the same each time.
-        with (
-            DRAWING,
-            matplotlib.rc_context({"svg.hashsalt": "firstphoton", "svg.fonttype": "none"}),
-        ):
-            self._drawn().savefig(file, format=suffix, dpi=_DOTS_PER_INCH, metadata=known)
+        described = "\n".join(self.lines)
+        with drawing():
+            save_figure(self._drawn(), file, suffix, _DOTS_PER_INCH, software(), described)
 
     def _drawn(self) -> Figure:
         from matplotlib.colors import ListedColormap  # noqa: PLC0415
