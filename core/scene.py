@@ -102,17 +102,18 @@ def parts_of(scene: Scene) -> tuple[str, ...]:
     return tuple(part for part in PARTS if getattr(scene, part) is not None)
 
 
-def without(scene: Scene, part: str) -> Scene:
-    """Return the scene without one of its `PARTS`.
+def without(scene: Scene, *parts: str) -> Scene:
+    """Return the scene without some of its `PARTS`.
 
     Raises
     ------
     ValueError
-        If there is no part of that name.
+        If there is no part of a name.
     """
-    require("part", part, part in PARTS, " or ".join(map(repr, PARTS)))
-    absent: dict[str, Any] = {part: None}
-    return replace(scene, **absent)
+    for part in parts:
+        require("part", part, part in PARTS, " or ".join(map(repr, PARTS)))
+    absent: dict[str, Any] = dict.fromkeys(parts)
+    return replace(scene, **absent) if parts else scene
 
 
 PAPER_GATE = Acquisition(100, 1e-9, 280e-9, n_pulses=1000)

@@ -12,8 +12,8 @@ from itertools import chain
 from textwrap import indent
 
 from app.model.state import CLOUDS, MOST_PROBABLE, NEIGHBOURS, VELOCITY, State, Viewing
-from app.model.store import Answer, bare
-from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
+from app.model.store import Answer
+from core import CORRECTIONS, ESTIMATORS, inspection, without
 from core.estimators import JUDGES
 from core.geometry import WHOLE, Box
 from core.io import RangeColors
@@ -107,16 +107,16 @@ def _simulation(answer: Answer) -> Lines:
         flux = "flux"
         yield assign("budget", "core.PhotonBudget", **changed_fields(request.budget))
         yield "scene, flux = budget.apply(scene)"
-    for part in PARTS:
-        if part in request.absent:
-            yield assign("scene", "core.without", "scene", literal(part))
+    parts = request.absent_parts
+    if parts:
+        yield assign("scene", "core.without", "scene", *map(literal, parts))
     own, acquisition = source.scene().acquisition, "scene.acquisition"
     if light.acquisition(own) != own:
         pulses = literal(light.n_pulses)
         yield assign("acquisition", "replace", acquisition, n_pulses=pulses)
         acquisition = "acquisition"
     seed = {"seed": literal(light.seed)} if light.seed else {}
-    groups = bare(source.scene(), request.absent).groups_of(light.acquisition(own).n_pulses)
+    groups = without(source.scene(), *parts).groups_of(light.acquisition(own).n_pulses)
     order = {"n_groups": literal(groups)} if groups else {}
     yield assign("capture", "core.simulate", "scene", acquisition, flux, **seed, **order)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache, partial
 from hashlib import sha256
@@ -117,14 +117,6 @@ class AddedTruth:
     """Options of `core.read_truth`."""
 
 
-def bare(scene: Scene, absent: Collection[str]) -> Scene:
-    """Return a scene without the parts that are switched off."""
-    for part in PARTS:
-        if part in absent:
-            scene = without(scene, part)
-    return scene
-
-
 def scene_source(title: str, name: str, **arguments: Any) -> Source:
     """Return a source of captures of a scene of `core.scenes`."""
     build = cache(partial(scenes[name], **arguments))
@@ -236,7 +228,12 @@ class Request:
     @property
     def scene(self) -> Scene:
         """The scene without the parts that are switched off."""
-        return bare(self.whole_scene, self.absent)
+        return without(self.whole_scene, *self.absent_parts)
+
+    @property
+    def absent_parts(self) -> tuple[str, ...]:
+        """Parts of the scene that are switched off."""
+        return tuple(part for part in PARTS if part in self.absent)
 
     @property
     def illumination(self) -> Illumination:

@@ -16,7 +16,7 @@ from core.effects import LIDAR_RATIO_SR, Backscatter, FaultyPixels, Jitter, Moti
 from core.estimators import estimate
 from core.scene import PARTS, Scene, parts_of, scenes, without
 from core.simulation import cumulative_trigger_probability, simulate
-from core.studies.ablation.plain import bare, plain_triggered
+from core.studies.ablation.plain import plain_triggered
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 GATE = Acquisition(n_bins=80, n_pulses=400)
@@ -47,7 +47,7 @@ def faulty(dark_count_hz: Any = 0.0, dead: Any = False) -> FaultyPixels:
 
 @pytest.mark.parametrize("name", scenes)
 def test_absent_parts_leave_the_plain_model_bit_for_bit(name: str) -> None:
-    scene = bare(scenes[name]())
+    scene = without(scenes[name](), *PARTS)
     assert parts_of(scene) == ()
     given = (scene, scene.acquisition, Flux(), Pulse())
     np.testing.assert_array_equal(cumulative_trigger_probability(*given), plain_triggered(*given))
@@ -83,6 +83,8 @@ def test_parts_are_known_by_name() -> None:
     assert parts_of(SCENE) == ()
     assert parts_of(scene) == ("motion", "jitter")
     assert parts_of(without(scene, "motion")) == ("jitter",)
+    assert parts_of(without(scene, "motion", "jitter")) == ()
+    assert without(scene) is scene
     assert set(PARTS) == set(vars(Scene(SCENE.range_m))) - {"range_m", "acquisition"}
     with pytest.raises(ValueError, match=r"part = 'rain' .*'motion'"):
         without(scene, "rain")
