@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import cycle
 from pkgutil import resolve_name
+from types import SimpleNamespace
 
 import numpy as np
 import panel as pn
@@ -499,12 +500,13 @@ def test_messages_name_files_without_folders(path, name):
 def test_a_page_that_cannot_be_built_leaves_the_open_one():
     broken = True
 
-    def build():
+    def build(session):
         if broken:
             raise OSError(28, "No space left on device")
-        return View(pn.pane.Str("there"), [])
+        return SimpleNamespace(view=View(pn.pane.Str("there"), []))
 
-    pages = Pages({"first": lambda: View([], []), "second": build})
+    first = SimpleNamespace(view=View([], []))
+    pages = Pages(None, {"first": lambda session: first, "second": build})
     for is_open in (False, True):
         broken = not is_open
         if broken:

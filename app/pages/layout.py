@@ -29,7 +29,7 @@ from app.model.truth import Truth, parts_of, with_truth
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.model.watched import Arrival
 from app.pages.catalog import PAGES
-from app.pages.navigation import Content, Page, Pages, Shared, View
+from app.pages.navigation import Pages, Shared
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, explored, looked_at, viewed
 from app.pages.shared.illumination import IlluminationPanel
@@ -256,13 +256,14 @@ class Layout:
             session.refused.append(text.no_page(state.page, self._pages))
             state.page = "Explore" if session.answer.request.source.is_scene else "Inspect"
         self._make_controls()
-        self.contents: dict[str, Content] = {}
         self.pages = Pages(
-            {each.name: partial(self._view_of, each) for each in PAGES},
+            session,
+            {each.name: each.build for each in PAGES},
             label="",
             help=", ".join(f"{each.name} {each.help}" for each in PAGES) + ".",
             first=state.page,
         )
+        self.contents = self.pages.contents
         self.pages.choice.param.update(sx=PAGE_BUTTONS, margin=(0, 0, 0, 8))
         self.page = self._template()
         self._subject: tuple[object, ...] = ()
@@ -272,10 +273,6 @@ class Layout:
             session.failures.remark(text.not_opened(arrivals.refused))
         if sentence := _about_link(session):
             session.failures.show(sentence)
-
-    def _view_of(self, page: Page) -> View:
-        content = self.contents[page.name] = page.build(self.session)
-        return content.view
 
     # Controls
 

@@ -92,25 +92,33 @@ class Pages:
 
     Parameters
     ----------
+    session : Session
     builders : mapping of str to callable
-        The builder of each page, by the name on its button.
+        The builder of each page from the session, by the name on its button.
     label, help : str
         Label and description of the row of buttons.
     orientation : {"horizontal", "vertical"}
         Orientation of the buttons.
     first : str, optional
         The page to open first; by default the first builder.
+
+    Attributes
+    ----------
+    contents : dict of str to Content
+        What was built.
     """
 
     def __init__(
         self,
-        builders: Mapping[str, Callable[[], View]],
+        session: Session,
+        builders: Mapping[str, Callable[[Session], Content]],
         label: str = "Page",
         help: str = "",
         orientation: str = "horizontal",
         first: str | None = None,
     ) -> None:
-        self._builders = builders
+        self._session, self._builders = session, builders
+        self.contents: dict[str, Content] = {}
         self._built: dict[str, View] = {}
         self._dark = False
         self.mains = {name: _holder(margin=(0, 12)) for name in builders}
@@ -158,7 +166,8 @@ class Pages:
         if name in self._built:
             self._built[name].show(True)
         else:
-            view = self._builders[name]()
+            self.contents[name] = self._builders[name](self._session)
+            view = self.contents[name].view
             view.paint(self._dark)
             # Drawn before it is placed, the page reaches the browser in one message.
             view.show(True)

@@ -169,13 +169,14 @@ class Inspect(Section):
             )
         )
         self._sections = Pages(
+            session,
             {
-                "Pixel": lambda: PixelSection(session, "pixel").view,
-                "Region": lambda: PixelSection(session, "region").view,
-                "Pins": lambda: PinsSection(session).view,
-                "Profile": lambda: ProfileSection(session).view,
-                "A/B": lambda: PairSection(session).view,
-                "Capture": lambda: CaptureSection(session).view,
+                "Pixel": partial(PixelSection, subject="pixel"),
+                "Region": partial(PixelSection, subject="region"),
+                "Pins": PinsSection,
+                "Profile": ProfileSection,
+                "A/B": PairSection,
+                "Capture": CaptureSection,
             },
             label="",
             help=text.SUBJECT_HELP,

@@ -131,27 +131,28 @@ class Paper:
             return paper.table_3(results, settings.sbr)
 
         self._sections = Pages(
+            session,
             {
-                "Figures 1, 2: the jump": lambda: (
-                    LiveFigures(session, Jump(), text.JUMP, jump, count=2).view
+                "Figures 1, 2: the jump": lambda session: LiveFigures(
+                    session, Jump(), text.JUMP, jump, count=2
                 ),
-                "Figure 4: two scales": lambda: (
-                    LiveFigures(session, Scales(), text.SCALES, two_scales, count=2).view
+                "Figure 4: two scales": lambda session: LiveFigures(
+                    session, Scales(), text.SCALES, two_scales, count=2
                 ),
-                "Figures 5, 6: pile-up": lambda: (
-                    LiveFigures(session, AtSBR(0.08), text.PILE_UP, pile_up, count=2).view
+                "Figures 5, 6: pile-up": lambda session: LiveFigures(
+                    session, AtSBR(0.08), text.PILE_UP, pile_up, count=2
                 ),
-                "The weights": lambda: (
-                    LiveFigures(session, Weights(), text.WEIGHTS, weights, count=1).view
+                "The weights": lambda session: LiveFigures(
+                    session, Weights(), text.WEIGHTS, weights, count=1
                 ),
-                "Table 2: six SBRs": lambda: (
-                    RepeatedTable(session, Repetitions(5), text.TABLE_2, plan_2, table_2).view
+                "Table 2: six SBRs": lambda session: RepeatedTable(
+                    session, Repetitions(5), text.TABLE_2, plan_2, table_2
                 ),
-                "Table 3: all methods": lambda: (
-                    RepeatedTable(session, RepeatedAt(5), text.TABLE_3, plan_3, table_3).view
+                "Table 3: all methods": lambda session: RepeatedTable(
+                    session, RepeatedAt(5), text.TABLE_3, plan_3, table_3
                 ),
-                "Figures 8, 9, 11, 12: images": lambda: RangeImages(session).view,
-                "What the paper does not report": lambda: NotReported(session).view,
+                "Figures 8, 9, 11, 12: images": RangeImages,
+                "What the paper does not report": NotReported,
             },
             label="Section",
             help=text.SECTIONS_HELP,

@@ -20,11 +20,12 @@ class Tradeoff:
 
     def __init__(self, session: Session) -> None:
         self._sections = Pages(
+            session,
             {
-                "Speed and accuracy": lambda: SpeedSection(session).view,
-                "Acquisition": lambda: AcquisitionSection(session).view,
-                "Ablation": lambda: AblationSection(session).view,
-                "Sensitivity": lambda: SensitivitySection(session).view,
+                "Speed and accuracy": SpeedSection,
+                "Acquisition": AcquisitionSection,
+                "Ablation": AblationSection,
+                "Sensitivity": SensitivitySection,
             },
             label="Study",
             help=text.SECTIONS_HELP,
