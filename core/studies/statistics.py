@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import bdtr, stdtrit
@@ -10,6 +12,9 @@ from scipy.special import bdtr, stdtrit
 from core.acquisition import Floats
 from core.checks import require
 from core.metrics import Interval
+
+Key = TypeVar("Key")
+Result = TypeVar("Result")
 
 MIN_REPEATS = 6
 """With fewer values even the range from smallest to largest covers the median in less than 95 %."""
@@ -46,3 +51,14 @@ def mean_interval(values: Floats, least: float = -math.inf, most: float = math.i
     mean = float(np.mean(values))
     half = float(stdtrit(n - 1, 0.975) * np.std(values, ddof=1) / math.sqrt(n))
     return Interval(mean, max(mean - half, least), min(mean + half, most))
+
+
+def mean_over_seeds(
+    found: Mapping[tuple[Key, int], Result],
+    key: Key,
+    seeds: Sequence[int],
+    value: Callable[[Result], float],
+    most: float = 1.0,
+) -> Interval:
+    """Return the `mean_interval` of a value, from 0 to `most`, of the results of all seeds."""
+    return mean_interval(np.array([value(found[key, seed]) for seed in seeds]), 0.0, most)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from core.pulse_groups import USUAL_GROUPS
 from core.scene import scenes
 from core.simulation import simulate
 from core.studies.outputs import Table
-from core.studies.statistics import mean_interval
+from core.studies.statistics import mean_over_seeds
 from core.studies.trials import mapped
 
 SPEEDS = (0.0, 2.0, 5.0, 10.0, 20.0)
@@ -112,7 +113,7 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
             f"Restoration degree within 3 bins, car receding in 1000 pulses, SBR {sbr:g}",
             ("method", *speeds),
             tuple(
-                (method, *(_mean(found, each, seeds, "restored", place) for each in conditions))
+                (method, *(_restored(found, each, seeds, place) for each in conditions))
                 for place, method in enumerate(METHODS)
             ),
             note,
@@ -122,7 +123,7 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
         "Restoration degree within 3 bins, scenes at rest",
         ("method", *(f"{each.scene}, SBR {each.sbr:g}" for each in still)),
         tuple(
-            (method, *(_mean(found, each, seeds, "restored", place) for each in still))
+            (method, *(_restored(found, each, seeds, place) for each in still))
             for place, method in enumerate(METHODS)
         ),
         note,
@@ -132,26 +133,30 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
         "Shared velocity of the car, in bins per 1000 pulses",
         ("SBR", "result", *speeds),
         tuple(
-            (f"{sbr:g}", title, *(_mean(found, each, seeds, name) for each in conditions))
+            (
+                f"{sbr:g}",
+                title,
+                *(
+                    mean_over_seeds(found, each, seeds, attrgetter(name), most)
+                    for each in conditions
+                ),
+            )
             for sbr, conditions in moving.items()
-            for name, title in (
-                ("error_bins", "RMS error"),
-                ("near", "share within 1"),
-                ("covered", "share in the 95 % interval"),
+            for name, title, most in (
+                ("error_bins", "RMS error", np.inf),
+                ("near", "share within 1", 1.0),
+                ("covered", "share in the 95 % interval", 1.0),
             )
         ),
         note,
     )
 
 
-def _mean(
+def _restored(
     found: Mapping[tuple[Moving, int], Found],
     condition: Moving,
     seeds: Sequence[int],
-    name: str,
-    place: int | None = None,
+    place: int,
 ) -> Interval:
-    """Return the mean of a result over the seeds, of one of `METHODS` where it has several."""
-    values = [getattr(found[condition, seed], name) for seed in seeds]
-    of_seeds = np.array(values if place is None else [each[place] for each in values])
-    return mean_interval(of_seeds, 0.0, np.inf if name == "error_bins" else 1.0)
+    """Return the mean restoration degree of one of `METHODS`."""
+    return mean_over_seeds(found, condition, seeds, lambda of: of.restored[place])

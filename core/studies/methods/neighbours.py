@@ -16,7 +16,7 @@ from core.estimators.unmixing import smoothed
 from core.inference.neighbours import pooled
 from core.metrics import Interval
 from core.studies.outputs import Table
-from core.studies.statistics import mean_interval
+from core.studies.statistics import mean_over_seeds
 from core.studies.trials import Condition, mapped
 
 SBRS = {
@@ -115,8 +115,7 @@ def _table(
     parts = ("all",) if scene == "uniform" else ("all", "inside", "at edges")
 
     def cell(condition: Condition, name: str, part: int) -> Interval:
-        of_seeds = np.array([found[condition, seed][name][part] for seed in seeds])
-        return mean_interval(of_seeds, 0.0, 1.0)
+        return mean_over_seeds(found, condition, seeds, lambda of: of[name][part])
 
     return Table(
         f"neighbours_{scene}",

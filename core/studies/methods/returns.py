@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from core.inference import FALSE_RETURN, Returns
 from core.scene import PAPER_GATE, Scene, net, scenes
 from core.simulation import simulate
 from core.studies.outputs import Table
-from core.studies.statistics import mean_interval
+from core.studies.statistics import mean_over_seeds
 from core.studies.trials import mapped
 from core.trigger import draw_counts
 
@@ -139,8 +140,7 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
     """Yield the tables; intervals are those of the mean over the seeds (95 %)."""
     n = f"Mean of {len(seeds)} captures, with 95 % intervals."
     pieces = [(sbr, seed) for sbr in SBRS for seed in seeds]
-    of_pieces = dict(mapped(alone, pieces, processes))
-    shares = {sbr: np.array([of_pieces[sbr, seed] for seed in seeds]) for sbr in SBRS}
+    both = dict(mapped(alone, pieces, processes))
     yield Table(
         "returns_alone",
         "Share of pixels in which both surfaces are found within 2 bins, each pixel by itself",
@@ -150,7 +150,7 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
                 sbr,
                 share,
                 *(
-                    mean_interval(shares[sbr][:, i, j], 0.0, 1.0)
+                    mean_over_seeds(both, sbr, seeds, itemgetter((i, j)))
                     for j in range(len(SEPARATIONS_BINS))
                 ),
             )
@@ -173,7 +173,7 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
                 each.kind,
                 each.sbr,
                 "with neighbours" if each.method == "image_posterior" else "by itself",
-                mean_interval(np.array([wrong[each, seed] for seed in seeds]), 0.0, 1.0),
+                mean_over_seeds(wrong, each, seeds, float),
             )
             for each in ONE_SURFACE
         ),
@@ -190,9 +190,7 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
             (
                 separation,
                 *(
-                    mean_interval(
-                        np.array([found[separation, seed][part] for seed in seeds]), 0.0, most
-                    )
+                    mean_over_seeds(found, separation, seeds, itemgetter(part), most)
                     for part, most in enumerate((1.0, 1.0, np.inf))
                 ),
             )
