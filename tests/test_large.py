@@ -18,11 +18,11 @@ from app.model.state import ReductionSettings, Viewing
 from app.model.store import Request, built_in_sources, compute, file_source
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
+from app.tasks.scheduler import Cancelled
 from core import Window
 from core.inference.flux import flux_prior_of
 from core.io import ReadOptions
 from core.io.readers.labelled import dataset
-from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT
 from tests.states import ask
 from tests.test_app import alert_of, values_of
@@ -79,8 +79,9 @@ def slow(monkeypatch):
     return steps
 
 
-def never():
-    return False
+def cancelled(_done, _of):
+    """Progress of work that has been cancelled."""
+    raise Cancelled
 
 
 # -- limits ----------------------------------------------------------------------------------------
@@ -115,7 +116,7 @@ def test_a_preview_is_read_once_in_growing_parts(path, whole, slow):
     answers = [compute(ask(source), None)]
     file = answers[0].cutout.file
     progress = []
-    while not file.read_on(lambda *done: progress.append(done), never):
+    while not file.read_on(lambda *done: progress.append(done)):
         answers.append(compute(ask(source), answers[-1]))
     answers.append(compute(ask(source), answers[-1]))
     shares = [answer.cutout.read for answer in answers]
@@ -143,9 +144,9 @@ def test_reading_ends_when_it_is_cancelled(path, slow):
     file = file_source(path).large(ReadOptions())
     first = file.preview
     with pytest.raises(Cancelled):
-        file.read_on(lambda *_: None, lambda: True)
+        file.read_on(cancelled)
     with pytest.raises(Cancelled):
-        file.cutout(Window((0, 20), (0, 20)), cancelled=lambda: True)
+        file.cutout(Window((0, 20), (0, 20)), cancelled)
     assert len(slow) == 1 and file.preview is first
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from app.tasks.busy import Busy
 from app.tasks.page import PageTasks
-from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane, Latest, LongWork, Step
+from app.tasks.scheduler import GENERAL, PAGE, SHORT, Cancelled, Lane, Latest, LongWork, Step
 from app.tasks.turns import ROUNDS_BETWEEN, Turns
 from tests.browser import eventually
 from tests.threads import HeldTasks
@@ -350,17 +350,18 @@ def test_steps_wait_for_a_page_that_is_away_and_keep_what_is_done():
 def test_a_piece_ends_when_its_page_is_away_and_starts_again_when_it_is_back():
     study, begun = Study(), []
 
-    def piece(_progress, cancelled):
+    def piece(progress):
+        progress(0, 1)
         begun.append(True)
-        while not cancelled():
-            if len(begun) == 2:
-                return "done"
+        while len(begun) == 1:
+            progress(0, 1)
             time.sleep(0.001)
-        raise RuntimeError("cancelled")
+        return "done"
 
     study.work.start_piece(piece, study.drawn.append)
     eventually(lambda: begun)
     study.page.is_away = True
+    study.page.run_one()  # the progress
     study.page.run_one()  # the end of the first attempt
     assert (study.drawn, study.failures, study.work.is_running) == ([], [], True)
     study.page.is_away = False
@@ -412,13 +413,16 @@ def test_a_failure_ends_the_work_and_is_reported():
 
 
 def test_one_piece_reports_its_progress_and_can_be_cancelled():
-    study, cancelled_seen = Study(), []
+    study, ended = Study(), []
 
-    def piece(progress, cancelled):
+    def piece(progress):
         progress(1, 4)
         assert study.gate.acquire(timeout=20)
-        cancelled_seen.append(cancelled())
-        progress(2, 4)
+        try:
+            progress(2, 4)
+        except Cancelled:
+            ended.append(True)
+            raise
         return "result"
 
     for is_cancelled in (False, True):
@@ -429,9 +433,10 @@ def test_one_piece_reports_its_progress_and_can_be_cancelled():
             study.work.cancel()
         study.gate.release()
         study.page.run_one()
-        study.page.run_one()
+        if not is_cancelled:
+            study.page.run_one()  # the result, after the progress
         assert not study.work.is_running
-    assert cancelled_seen == [False, True]
+    assert ended == [True]
     assert study.drawn == ["result"]
 
 

@@ -226,17 +226,20 @@ def test_the_printed_link_has_a_token_and_ctrl_c_stops():
 
 STOPPED_AT_A_BAD_MOMENT = """
 import os, signal, sys, time
+from contextlib import suppress
 from types import SimpleNamespace
 from app import __main__ as started
-from app.tasks.scheduler import LongWork
+from app.tasks.scheduler import Cancelled, LongWork
 
 def nothing(*_):
     pass
 
-def long_work(progress, cancelled):
+def long_work(progress):
     print("begun", flush=True)
-    while not cancelled():
-        time.sleep(0.01)
+    with suppress(Cancelled):
+        while True:
+            progress(0, 1)
+            time.sleep(0.01)
     print("ended", flush=True)
 
 class Last:

@@ -8,8 +8,8 @@ import pytest
 from app.model.store import built_in_sources
 from app.pages.session import Session
 from app.pages.shared.method import MethodChoice
+from app.tasks.scheduler import Cancelled
 from core import TrackingParameters, tuned
-from core.studies.tradeoff import Cancelled
 from tests.threads import HeldTasks, change
 
 CHOOSE = "Choose for this capture"

@@ -24,13 +24,14 @@ from app.pages.tradeoff.acquisition import AcquisitionSection
 from app.pages.tradeoff.sensitivity import SensitivitySection
 from app.pages.tradeoff.speed import Effort, SpeedSection, show_point, source_of
 from app.plots import elements as plots
+from app.tasks.scheduler import Cancelled
 from app.theme import DARK, LIGHT
 from core import ESTIMATORS
 from core.scene import parts_of
 from core.studies.ablation import Requirement
 from core.studies.outputs import Table
 from core.studies.sensitivity import numbers
-from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, pareto_front
+from core.studies.tradeoff import best_within, cheapest_reaching, pareto_front
 from core.studies.trials import default_methods
 from tests.browser import chosen, eventually
 from tests.threads import HeldTasks, change, control
@@ -40,8 +41,9 @@ def ignored(_done, _of):
     """Progress that nobody reads."""
 
 
-def never():
-    return False
+def cancelled(_done, _of):
+    """Progress of work that has been cancelled."""
+    raise Cancelled
 
 
 def small_sources():
@@ -63,7 +65,7 @@ def found():
     """
     section = SpeedSection(Session(small_sources()))
     section.change(Effort(repetitions=2, repeats=6, merges="none"))
-    *asked, points = section.work()(ignored, never)
+    *asked, points = section.work()(ignored)
     timed = [
         replace(point, seconds=(n * 1e-3,) * len(point.seconds))
         for n, point in enumerate(points, 1)
@@ -95,11 +97,10 @@ class Piece:
         session.failures.shown.subscribe(self.shown.append)
         self.piece = OnePiece(session, lambda: self.work, draw or self.drawn.append, "steps")
 
-    def work(self, progress, cancelled):
+    def work(self, progress):
         progress(1, 4)
         while not self.leave.wait(0.005):
-            if cancelled():
-                raise Cancelled
+            progress(1, 4)
         return "result"
 
     @property
@@ -239,7 +240,7 @@ def test_any_method_is_shown_on_explore(measured):
 def test_a_simulation_like_a_file_is_acquired_in_other_ways(session):
     change(session, source="sample")
     section = AcquisitionSection(session)
-    section.draw(section.work()(ignored, never))
+    section.draw(section.work()(ignored))
     assert "the capture has no truth" in section.subject.text
     for each in section.cards:
         drawn = {renderer.name for renderer in each.figure.renderers}
@@ -250,7 +251,7 @@ def test_a_simulation_like_a_file_is_acquired_in_other_ways(session):
 
 def test_the_simulation_can_be_cancelled(session):
     with pytest.raises(Cancelled):
-        AcquisitionSection(session).work()(ignored, lambda: True)
+        AcquisitionSection(session).work()(cancelled)
 
 
 # -- ablation --------------------------------------------------------------------------------------
@@ -287,7 +288,7 @@ def test_parts_and_corrections_are_switched_off_and_on(ablation, session):
 
 
 def test_verdicts_are_those_of_the_scene_with_its_flux(ablation, session):
-    verdicts = ablation.work()(ignored, never)
+    verdicts = ablation.work()(ignored)
     ablation.draw(verdicts)
     rows = rows_of(ablation)
     for each in verdicts.found:

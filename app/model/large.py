@@ -21,7 +21,6 @@ from core.checks import require
 from core.inference import FluxPrior
 from core.io import bytes_of
 from core.out_of_core import WindowReader
-from core.studies.tradeoff import Cancelled
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -129,23 +128,23 @@ class LargeFile:
                 self._preview = self._whole_cutout()
             return self._preview
 
-    def read_on(self, progress: Progress, cancelled: Callable[[], bool]) -> bool:
+    def read_on(self, progress: Progress) -> bool:
         """Double what the preview has read; return whether it is final.
+
+        `progress` is called before each read and after the last; it may raise.
 
         Raises
         ------
-        Cancelled
-            If `cancelled` returned True.
         CaptureError
             If a part of the file cannot be read.
         """
         reader = self._reader
         enough = 2 * reader.done
         while not reader.is_complete and reader.done < enough:
-            _raise_if(cancelled)
+            progress(reader.done, reader.of + 1)
             with self._reading:
                 reader.read_some()
-            progress(reader.done, reader.of + 1)
+        progress(reader.done, reader.of + 1)
         flux_prior = self._flux_prior if reader.is_complete else None
         with self._reading:
             self._preview = self._whole_cutout(flux_prior)
@@ -155,18 +154,13 @@ class LargeFile:
         read, capture = float(self._reader.seen.mean()), self._reader.capture(flux_prior)
         return Cutout(self, self.whole, capture, read, is_final=flux_prior is not None)
 
-    def cutout(
-        self,
-        window: Window | None,
-        progress: Progress = lambda done, of: None,
-        cancelled: Callable[[], bool] = lambda: False,
-    ) -> Cutout:
+    def cutout(self, window: Window | None, progress: Progress = lambda done, of: None) -> Cutout:
         """Return the preview, or a window; the latest window is kept.
+
+        `progress` is called before each read and after the last; it may raise.
 
         Raises
         ------
-        Cancelled
-            If `cancelled` returned True.
         CaptureError
             If a part of the file cannot be read.
         ValueError
@@ -182,10 +176,9 @@ class LargeFile:
         require("pixels of a window", n_pixels, n_pixels <= max(most, 1), f"at most {most:,}")
         reader = WindowReader(self._counts, window)
         while not reader.is_complete:
-            _raise_if(cancelled)
-            reader.read_some()
             progress(reader.done, reader.of + 1)
-        _raise_if(cancelled)
+            reader.read_some()
+        progress(reader.done, reader.of + 1)
         capture = reader.capture(self._flux_prior)
         self._latest = Cutout(self, window, capture, read=1.0, is_final=True)
         return self._latest
@@ -199,11 +192,6 @@ class LargeFile:
     @cached_property
     def _sampled_flux_prior(self) -> FluxPrior:
         return sampled_flux_prior(self._counts)
-
-
-def _raise_if(cancelled: Callable[[], bool]) -> None:
-    if cancelled():
-        raise Cancelled
 
 
 def open_large(path: Path, options: dict[str, Any]) -> LargeFile | None:

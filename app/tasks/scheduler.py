@@ -20,8 +20,12 @@ from app.tasks.busy import Busy
 Result = TypeVar("Result")
 Act = Callable[[], None]
 Failed = Callable[[Exception], None]
-Work = Callable[[Callable[[int, int], None], Callable[[], bool]], Result]
-"""Long work that calls ``progress(done, of)`` now and then, and raises once ``cancelled()``."""
+Work = Callable[[Callable[[int, int], None]], Result]
+"""Long work that calls ``progress(done, of)`` now and then, which may raise `Cancelled`."""
+
+
+class Cancelled(Exception):
+    """Long work is to end early."""
 
 
 class PageThread(Protocol):
@@ -308,8 +312,7 @@ class LongWork:
     def start_piece(self, work: Work[Result], draw: Callable[[Result], None]) -> None:
         """Run work in one piece, in place of the present work, and draw its result."""
         run = _Run(is_running=True)
-        progress = partial(self._report, run)
-        run.steps = [Step(partial(work, progress, lambda: self._is_cancelled(run)), draw)]
+        run.steps = [Step(partial(work, partial(self._report, run)), draw)]
         self._begin(run)
 
     def cancel(self) -> None:
@@ -359,6 +362,8 @@ class LongWork:
             self._failed(error)
 
     def _report(self, run: _Run, done: int, of: int) -> None:
+        if self._is_cancelled(run):
+            raise Cancelled
         run.done, run.of = done, of
         if not run.is_reporting:  # a busy page skips reports in between
             run.is_reporting = True

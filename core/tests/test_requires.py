@@ -152,15 +152,18 @@ def test_pile_up_needs_a_correction_by_day_and_none_by_night() -> None:
 @pytest.mark.compiled
 def test_rows_are_reported_one_by_one_and_can_be_cancelled() -> None:
     calls: list[tuple[int, int]] = []
-    range_m = GATE.bin_to_range_m(np.full((3, 3), 40.0))
-    found = requirements(
-        Scene(range_m, acquisition=replace(GATE, n_pulses=20)),
-        seeds=range(2),
-        progress=lambda done, of: calls.append((done, of)),
-        cancelled=lambda: len(calls) == 2,
+
+    def cancelled(done: int, of: int) -> None:
+        calls.append((done, of))
+        if done == 2:
+            raise InterruptedError
+
+    scene = Scene(
+        GATE.bin_to_range_m(np.full((3, 3), 40.0)), acquisition=replace(GATE, n_pulses=20)
     )
-    assert calls == [(1, 3), (2, 3)]
-    assert len(found) == 2
+    with pytest.raises(InterruptedError):
+        requirements(scene, seeds=range(2), progress=cancelled)
+    assert calls == [(0, 3), (1, 3), (2, 3)]
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,6 @@ from core.studies.tradeoff import measure
 from core.studies.tradeoff import plan as plans
 from core.studies.tradeoff.acquisition import Sweep
 from core.studies.tradeoff.measure import (
-    Cancelled,
     Candidate,
     Piece,
     Point,
@@ -359,9 +358,16 @@ def test_every_setting_in_bins_is_rescaled_or_declared_kept(name: str) -> None:
 
 
 def test_a_study_can_be_cancelled_and_refuses_what_it_cannot_measure(stairs: Simulation) -> None:
-    answers = iter([False, True])
-    with pytest.raises(Cancelled):
-        study([(stairs, CONFIGURATIONS[:1])], seeds=(1, 2), cancelled=lambda: next(answers))
+    calls: list[int] = []
+
+    def cancelled(done: int, of: int) -> None:
+        calls.append(done)
+        if done:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        study([(stairs, CONFIGURATIONS[:1])], seeds=(1, 2), progress=cancelled)
+    assert len(calls) == 2
     with pytest.raises(ValueError, match="seeds = 1 is not accepted"):
         study([(stairs, CONFIGURATIONS)], seeds=(1,))
     with pytest.raises(ValueError, match="repeats = 5 is not accepted"):

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.large import Cutout, LargeFile
+from app.model.large import Cutout, LargeFile, Progress
 from app.model.store import Answer
 from app.pages.session import Session
 from app.pages.shared.studies import OnePiece
@@ -151,21 +150,13 @@ class LargeView:
             for name, field in self._bounds.items()
         )
         window = file.fitting(rows, cols)
-
-        def work(
-            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> Window | None:
-            return file.cutout(window, progress, cancelled).window
-
-        return work
+        return lambda progress: file.cutout(window, progress).window
 
     def _reading_on(self, file: LargeFile) -> Work[Window | None]:
         """Return the work that reads the rest of the preview and shows it from time to time."""
 
-        def work(
-            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> Window | None:
-            while not file.read_on(progress, cancelled):
+        def work(progress: Progress) -> Window | None:
+            while not file.read_on(progress):
                 self._session.tasks.queue(self._session.estimate.refresh)
             return None
 

@@ -15,7 +15,6 @@ from app.pages.session import Session
 from app.tasks.scheduler import Step, Work
 from app.widgets.cards import button
 from app.widgets.controls import Sentence
-from core.studies.tradeoff import Cancelled
 
 Result = TypeVar("Result")
 
@@ -173,19 +172,6 @@ class OnePiece(_ControlledWork, Generic[Result]):
     def _failed(self, error: Exception) -> None:
         self._starts_by_itself = False
         super()._failed(error)
-
-
-def cancellable(
-    progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-) -> Callable[[int, int], None]:
-    """Return a progress function that raises `Cancelled` once the work is cancelled."""
-
-    def report(done: int, of: int) -> None:
-        if cancelled():
-            raise Cancelled
-        progress(done, of)
-
-    return report
 
 
 def aside(explanation: str, *controls: Any) -> pn.Column:

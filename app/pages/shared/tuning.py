@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
 from app.model.methods import METHOD_TITLES
 from app.model.store import Answer, Request, same_capture
 from app.pages.session import Session
-from app.pages.shared.studies import OnePiece, cancellable
+from app.pages.shared.studies import OnePiece
 from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import NARROW_TABLE, Sentence, Table
@@ -83,11 +82,7 @@ class SettingsChooser:
     def _work(self) -> Work[Tuning]:
         answer = self._session.answer
         self._subject = answer.request
-
-        def work(progress: Callable[[int, int], None], cancelled: Callable[[], bool]) -> Tuning:
-            return tuned(answer.capture, answer.method, cancellable(progress, cancelled))
-
-        return work
+        return lambda progress: tuned(answer.capture, answer.method, progress)
 
     def _draw(self, found: Tuning) -> None:
         if self._subject is None or not _same_subject(self._subject, self._session.request):

@@ -91,13 +91,14 @@ class AblationSection(SettingsSection[Repetitions]):
         request, whole = self.session.answer.request, self.session.answer.whole
         repetitions = self.settings.repetitions
 
-        def work(progress: Callable[[int, int], None], cancelled: Callable[[], bool]) -> Verdicts:
-            reports: dict[str, Any] = {"progress": progress, "cancelled": cancelled}
+        def work(progress: Callable[[int, int], None]) -> Verdicts:
             if not request.source.is_scene:
-                return Verdicts(request, 0, requirements(whole, **reports))
+                return Verdicts(request, 0, requirements(whole, progress=progress))
             scene, light, seeds = request.whole_scene, request.illumination, range(repetitions)
             gate = light.acquisition(scene.acquisition)
-            found = requirements(scene, light.flux, acquisition=gate, seeds=seeds, **reports)
+            found = requirements(
+                scene, light.flux, acquisition=gate, seeds=seeds, progress=progress
+            )
             return Verdicts(request, repetitions, found)
 
         return work

@@ -13,7 +13,7 @@ from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.outputs import CurveCard, TableCard
 from app.pages.shared.section import Repetitions, SettingsSection
-from app.pages.shared.studies import OnePiece, cancellable
+from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import text
 from app.pages.tradeoff.speed import affordable, source_of
 from app.tasks.scheduler import Work
@@ -106,15 +106,12 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         request, source = self.session.answer.request, source_of(self.session.answer)
         repetitions = self.settings.repetitions
 
-        def work(
-            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> tuple[Request, str, list[Any]]:
+        def work(progress: Callable[[int, int], None]) -> tuple[Request, str, list[Any]]:
             affordable(source, ())
             simulation = (
                 source if isinstance(source, Simulation) else surrogate_of(source, source.source)
             )
-            report = cancellable(progress, cancelled)
-            found = acquisition_sweeps([simulation], range(repetitions), progress=report)
+            found = acquisition_sweeps([simulation], range(repetitions), progress=progress)
             said = text.simulated(simulation.name, repetitions, simulation.note)
             return request, said, list(acquisition_items(found))
 

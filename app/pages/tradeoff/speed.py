@@ -195,15 +195,12 @@ class SpeedSection(SettingsSection[Effort]):
         merges = (1, 2, 4) if effort.merges == ANY_MERGE else (1,)
         chosen = candidates(methods(answer), merges)
 
-        def work(
-            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> tuple[Request, Effort, list[Point]]:
+        def work(progress: Callable[[int, int], None]) -> tuple[Request, Effort, list[Point]]:
             points = study(
                 [(source, affordable(source, chosen))],
                 seeds=range(effort.repetitions),
                 repeats=effort.repeats,
                 progress=progress,
-                cancelled=cancelled,
             )
             return answer.request, effort, points
 

@@ -42,7 +42,6 @@ def requirements(
     method: str = "likelihood",
     seeds: Sequence[int] = range(16),
     progress: Callable[[int, int], None] = lambda done, of: None,
-    cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Requirement, ...]:
     """Judge every part of a scene, and every correction and extension of an estimator.
 
@@ -59,9 +58,8 @@ def requirements(
     seeds : sequence of int
         Seeds of a scene's captures, at least 2; compared captures share them.
     progress : callable
-        ``(rows done, rows in all)``, called after each row.
-    cancelled : callable
-        Called before each row; on True the remaining rows are left out.
+        ``(rows done, rows in all)``, called before the first row and after each; an exception that
+        it raises cancels the work.
 
     Returns
     -------
@@ -84,9 +82,8 @@ def requirements(
         rows += [partial(_extension, study, name) for name in EXTENSIONS]
         rows += [partial(_part, study, name) for name in parts_of(subject)]
     found: list[Requirement] = []
+    progress(0, len(rows))
     for row in rows:
-        if cancelled():
-            break
         found.append(row())
         progress(len(found), len(rows))
     return tuple(found)

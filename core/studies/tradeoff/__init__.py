@@ -1,6 +1,6 @@
 """Speed against accuracy, and how to acquire."""
 
-from core.studies.tradeoff.measure import Cancelled, Candidate, Point, Source, candidates, study
+from core.studies.tradeoff.measure import Candidate, Point, Source, candidates, study
 from core.studies.tradeoff.page import (
     acquired,
     acquiring_items,
@@ -20,7 +20,6 @@ from core.studies.tradeoff.pareto import (
 from core.studies.tradeoff.surrogate import Simulation, like, surrogate_of
 
 __all__ = [
-    "Cancelled",
     "Candidate",
     "Point",
     "Recommendation",

@@ -284,10 +284,6 @@ class Point:
         }
 
 
-class Cancelled(Exception):
-    """The study was cancelled."""
-
-
 MERGES = (1, 2, 4)
 VARIED = ("tracking", "cfar", "coates", "likelihood")
 """Methods that make up Pareto fronts, of which more variations are measured."""
@@ -339,7 +335,6 @@ def study(
     repeats: int = 9,
     processes: int = 1,
     progress: Callable[[int, int], None] = lambda done, of: None,
-    cancelled: Callable[[], bool] = lambda: False,
 ) -> list[Point]:
     """Measure candidates.
 
@@ -360,9 +355,8 @@ def study(
         Share the scoring. Memory is always measured in another process, so a script that calls
         this needs its ``if __name__ == "__main__"``. Times are taken afterwards, in this process.
     progress : callable
-        ``(images ranged, images in all)``.
-    cancelled : callable
-        Called whenever `progress` is; True cancels the study.
+        ``(images ranged, images in all)``, called at the start and whenever images are
+        done; an exception that it raises cancels the study.
 
     Returns
     -------
@@ -373,8 +367,6 @@ def study(
     ------
     ValueError
         If there is no target, or there are too few seeds or repeats.
-    Cancelled
-        If `cancelled` returned True.
     """
     require("seeds", len(seeds), len(seeds) >= 2, "at least 2")
     require("repeats", repeats, repeats >= MIN_REPEATS, f"at least {MIN_REPEATS}")
@@ -390,8 +382,6 @@ def study(
 
     def advance(n: int) -> None:
         nonlocal done
-        if cancelled():
-            raise Cancelled
         done += n
         progress(done, of)
 
