@@ -499,7 +499,7 @@ def flat_target(size: int = 64, onset_bin: float = 50.0, seeds: Sequence[int] = 
             "printed RD, car": lambda m: TABLE_3[m.estimator].rd if m.estimator in TABLE_3 else "",
         },
         f"Restoration degree within 3 bins at SBR 0.06. In {wide:.0%} of the car's 3 x 3 windows, "
-        " ranges differ by more than a bin. KDE and Chi pool these pixels: there the echo "
+        "ranges differ by more than a bin. KDE and Chi pool these pixels: there the echo "
         "is spread over several bins, on the flat target it is not.",
     )
 
