@@ -17,7 +17,7 @@ from app.model.state import (
 )
 from app.model.store import Answer, same_pixels
 from core.inspection import pixels_in
-from core.report import telling_pixel
+from core.report import representative_pixel
 
 KINDS = {"image": IMAGES, "map": MAPS, "cloud_color": CLOUD_COLORS}
 """Parameters of which some values require an image of the capture, with all values."""
@@ -39,7 +39,7 @@ def possible_kinds(answer: Answer) -> dict[str, list[str]]:
 
 def defaults_of(answer: Answer) -> dict[str, Any]:
     """Return the defaults that a capture brings, by the state's parameter."""
-    return {"pixel": telling_pixel(answer.capture, answer.run.image)}
+    return {"pixel": representative_pixel(answer.capture, answer.run.image)}
 
 
 def offer_kinds(state: State, answer: Answer) -> None:

@@ -135,7 +135,9 @@ def _of_scenes(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation]
     ]
     plan: plans.Plan = []
     for each in simulations:
-        plan += [(each, plans.all_candidates(each))] if chosen.short else plans.over_pulses(each)
+        plan += (
+            [(each, plans.all_candidates(each))] if chosen.short else plans.plan_over_pulses(each)
+        )
     if not chosen.short:
         plan += plans.threaded(sbrs[-1], signal)
     return plan, simulations

@@ -15,7 +15,7 @@ from core.geometry import WHOLE, Box
 from core.io.writers.colors import RangeColors
 from core.io.writers.whole import whole_file
 
-__all__ = ["LEAST_CONFIDENCE", "save_report", "telling_pixel", "write_report"]
+__all__ = ["LEAST_CONFIDENCE", "representative_pixel", "save_report", "write_report"]
 
 LEAST_CONFIDENCE = 0.9
 """Confidence below which maps and cloud hide an estimate, unless stated otherwise."""
@@ -53,7 +53,7 @@ def save_report(
     overwrite : bool
         Replace a file of that name.
     pixel : (int, int), optional
-        Row and column of the pixel to show; by default `telling_pixel`.
+        Row and column of the pixel to show; by default `representative_pixel`.
     least_confidence : float
         Maps and cloud hide estimates of less confidence, 0 to 1. Figures of error include them.
     pixel_angle_rad : float, optional
@@ -122,7 +122,7 @@ def write_report(
     require("image", f"shape {shape}", shape == capture.shape, f"shape {capture.shape}")
     made_by = image.made_by
     require("image.made_by", made_by, made_by is not None, "an image that core.estimate returned")
-    known = telling_pixel(capture, image) if pixel is None else pixel
+    known = representative_pixel(capture, image) if pixel is None else pixel
     page = page_of(
         capture,
         image,
@@ -137,7 +137,7 @@ def write_report(
     file.write(page.encode("utf-8", "backslashreplace"))
 
 
-def telling_pixel(capture: Capture, image: RangeImage) -> tuple[int, int]:
+def representative_pixel(capture: Capture, image: RangeImage) -> tuple[int, int]:
     """Return the pixel nearest to the centre with a target, or else with a confident estimate.
 
     Without any of these, the pixel in the centre.

@@ -18,7 +18,7 @@ import core
 from core.cli import main
 from core.inference import fit_of, fit_p_values, share_below
 from core.inspection import capture_report, pixel_report, reported_check
-from core.report import telling_pixel, write_report
+from core.report import representative_pixel, write_report
 from core.typesetting import LEAST_PROBABILITY
 
 pytestmark = pytest.mark.files
@@ -247,11 +247,11 @@ def test_a_large_image_is_thinned_and_its_file_stays_small() -> None:
 def test_the_default_pixel_has_a_target_or_a_confident_estimate(image: core.RangeImage) -> None:
     truth_m = np.full(CAPTURE.shape, np.nan)
     truth_m[2, 3] = truth_m[11, 0] = 50.0
-    assert telling_pixel(replace(CAPTURE, truth_range_m=truth_m), image) == (2, 3)
+    assert representative_pixel(replace(CAPTURE, truth_range_m=truth_m), image) == (2, 3)
     confidence = np.where(truth_m > 0, 0.95, 0.5)
     unknown = replace(CAPTURE, truth_range_m=None)
-    assert telling_pixel(unknown, replace(image, confidence=confidence)) == (2, 3)
-    assert telling_pixel(unknown, replace(image, confidence=0 * confidence)) == (6, 6)
+    assert representative_pixel(unknown, replace(image, confidence=confidence)) == (2, 3)
+    assert representative_pixel(unknown, replace(image, confidence=0 * confidence)) == (6, 6)
 
 
 def test_what_cannot_be_reported_is_refused(tmp_path: Path, image: core.RangeImage) -> None:

@@ -467,7 +467,7 @@ def car() -> Simulation:
 @pytest.mark.compiled
 def test_theory_and_simulation_agree_where_theory_is_accurate(car: Simulation) -> None:
     varied = [
-        ((200, 1000), acquiring.over_pulses(car, (200, 1000))),
+        ((200, 1000), acquiring.simulated_over_pulses(car, (200, 1000))),
         ((0.5, 1.0), acquiring.over_exposures(car, (0.5, 1.0))),
     ]
     pulses, exposures = acquiring.sweeps(varied, seeds=range(3))

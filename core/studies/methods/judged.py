@@ -1,4 +1,4 @@
-"""Confidence by the pixel alone and by the posterior of the image: which estimates do they show?"""
+"""Calibration of the confidence from the pixel alone and from the image posterior."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Pulses, exposure and gate length required for a restoration degree.
 
-Two predictions side by side: theory (`core.limits`) for the likeliest delay with known signal and
-background and uniform depths, in milliseconds per image, and simulated captures, ranged by the
-exact likelihood with known flux (oracle) and with estimated flux.
+Two predictions: by theory (`core.limits`), in milliseconds, for known fluxes and uniform depths;
+and by simulated captures, ranged by the likelihood with known (oracle) and with estimated flux.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class Sweep:
     simulated: Mapping[str, tuple[Interval, ...]]
 
 
-def over_pulses(simulation: Simulation, n_pulses: Sequence[int]) -> list[Simulation]:
+def simulated_over_pulses(simulation: Simulation, n_pulses: Sequence[int]) -> list[Simulation]:
     """Return the simulation with other numbers of pulses."""
     return [simulation.with_pulses(n) for n in n_pulses]
 

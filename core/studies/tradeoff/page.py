@@ -325,7 +325,7 @@ def acquisition_sweeps(
     for each in simulations:
         gates = acquisition.over_gates(each)
         varied += [
-            (acquisition.PULSES, acquisition.over_pulses(each, acquisition.PULSES)),
+            (acquisition.PULSES, acquisition.simulated_over_pulses(each, acquisition.PULSES)),
             (acquisition.EXPOSURES, acquisition.over_exposures(each, acquisition.EXPOSURES)),
             ([gate.acquisition.n_bins for gate in gates], gates),
         ]

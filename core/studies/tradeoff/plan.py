@@ -34,7 +34,7 @@ def all_candidates(simulation: Simulation) -> list[Candidate]:
     return candidates() + variations(simulation.window)
 
 
-def over_pulses(simulation: Simulation) -> Plan:
+def plan_over_pulses(simulation: Simulation) -> Plan:
     """Return every method at every number of pulses, and all candidates at the scene's own."""
     own = simulation.acquisition.n_pulses
     return [
