@@ -43,6 +43,7 @@ from app.widgets.figures import (
 from app.widgets.image_view import CONTAINER, JOINED_BORDER_PX
 from app.widgets.method_picture import ScaleBar
 from core.io import ColorScale
+from core.metrics import Interval
 from core.parameters import Number
 from core.studies import outputs as items
 from core.typesetting import typeset
@@ -385,15 +386,14 @@ def spelled(name: str) -> str:
 def table_of(item: items.Table) -> tuple[list[Any], list[dict[str, Any]]]:
     """Return columns and rows for `app.widgets.controls.Table`.
 
-    "low" and "high" become a smaller line below the value before them, "kind" one below the name,
-    and a difference from a printed value is also classified. Empty columns are left out.
+    The limits of an interval become a smaller line below its value, "kind" one below the name, and
+    a difference from a printed value is also classified. Empty columns are left out.
     """
     names = item.columns
-    hidden = {"low", "high", "kind"}
     shown = [
         place
         for place, name in enumerate(names)
-        if name not in hidden and any(row[place] != "" for row in item.rows)
+        if name != "kind" and any(row[place] != "" for row in item.rows)
     ]
     if "method" in names:  # it names the row, in whichever column
         shown.sort(key=lambda place: names[place] != "method")
@@ -421,15 +421,16 @@ def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]
     if names[place] in FORMATS:
         return [format(value, FORMATS[names[place]]), value, ""]
     below = ""
-    if names[place + 1 : place + 3] == ("low", "high"):
-        low, high = row[place + 1 : place + 3]
-        below = f"{typeset(items.as_text(low))} to {typeset(items.as_text(high))}"
     if names[place] == "difference":
-        low, high, printed = row[place - 3 : place]
-        larger_is_better = names[place - 4].startswith("RD")
+        found, printed = row[place - 2 : place]
+        larger_is_better = names[place - 2].startswith("RD")
+        is_chance = found.low <= printed <= found.high
         is_better = (value > 0) == larger_is_better
-        below = "within chance" if low <= printed <= high else "better" if is_better else "worse"
+        below = "within chance" if is_chance else "better" if is_better else "worse"
         return [typeset(f"{value:+.4f}"), value, below]
+    if isinstance(value, Interval):
+        below = f"{typeset(items.as_text(value.low))} to {typeset(items.as_text(value.high))}"
+        value = value.value
     known = not math.isnan(value)
     return [typeset(items.as_text(value)) if known else "–", value if known else None, below]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -291,13 +291,9 @@ def table_5(results: Results) -> Table:
 _COLUMNS = (
     "method",
     "RD, 3 bins",
-    "low",
-    "high",
     "printed RD",
     "difference",
     "RMSE m",
-    "low",
-    "high",
     "printed RMSE m",
     "difference",
     "RD, 1 bin",
@@ -315,14 +311,14 @@ def _row(
     first: str, method: Method, scores: Sequence[Score], printed: Printed | None
 ) -> tuple[Any, ...]:
     s = summary(scores)
-    rd, rmse = astuple(s.rd[2]), astuple(s.rmse_m)
+    rd, rmse_m = s.rd[2], s.rmse_m
     if method.estimator not in TABLE_3:  # the paper has no other methods
         printed = None
     return (
         first,
         method.name,
-        *(*rd, *((printed.rd, rd[0] - printed.rd) if printed else ("", ""))),
-        *(*rmse, *((printed.rmse_m, rmse[0] - printed.rmse_m) if printed else ("", ""))),
+        *(rd, *((printed.rd, rd.value - printed.rd) if printed else ("", ""))),
+        *(rmse_m, *((printed.rmse_m, rmse_m.value - printed.rmse_m) if printed else ("", ""))),
         *(s.rd[0].value, s.rd[1].value, s.mae_m, s.bias_m, s.inlier_rmse_m),
         *(s.rd_variance, s.answered, s.milliseconds),
     )
