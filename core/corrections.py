@@ -36,10 +36,10 @@ def without_correction(capture: Capture, correction: str) -> Capture:
     """
     require("correction", correction, correction in CORRECTIONS, " or ".join(CORRECTIONS))
     if correction == "pile_up":
-        less = replace(capture, detection="all", flux_prior=None)
+        all_photons = replace(capture, detection="all", flux_prior=None)
         # Or the fewer photons late in the gate would be taken for a background that falls.
         shape = detailed_flux_prior_of(capture).background_shape
-        return replace(less, flux_prior=flux_prior_over(less, shape))
+        return replace(all_photons, flux_prior=flux_prior_over(all_photons, shape))
     if correction == "pulse_shape":
         mean_s, sigma_s = moments_s(capture.pulse)
         # The time zero of a Gaussian is its centre, so the gate opens earlier after it.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.model import text
-from app.model.address import Link, defaults, query_of
+from app.model.address import LINK_NAMES, Link, defaults, query_of
 from app.model.state import Illumination, ReductionSettings, State, Viewing
 from app.model.store import built_in_sources
 from app.pages.session import Session
@@ -37,7 +37,7 @@ def test_every_parameter_and_field_is_in_the_link(name):
     for value in another(name):
         state = State(**{name: value})
         query = query_of(state, {})
-        assert name in query
+        assert LINK_NAMES.get(name, name) in query
         assert restored(query) == (chosen(state), [])
 
 
@@ -118,7 +118,7 @@ def test_a_session_opens_on_its_link():
     assert request.source.title.startswith("Building")
     assert request.light == Illumination(sbr=0.2)
     assert request.tracking == TrackingParameters(l=0.006)
-    assert request.less == ReductionSettings(merge=2, pool=2)
+    assert request.reduction == ReductionSettings(merge=2, pool=2)
     first.state.param.update(pixel=(3, 5), viewing=Viewing(0.5, 1.5), image="Counts")
     again = opened(first.query())
     assert again.refused == []

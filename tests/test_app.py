@@ -117,7 +117,7 @@ def test_only_what_changed_is_computed_again(car):
 def test_the_page_computes_what_is_faster_than_drawing(car):
     other = {"tracking": PRESETS["literal"]}
     assert lane_of(replace(car.request, **other), car) is PAGE
-    for again in ({"light": Illumination(seed=1)}, {"less": ReductionSettings(skip=2)}):
+    for again in ({"light": Illumination(seed=1)}, {"reduction": ReductionSettings(skip=2)}):
         assert lane_of(replace(car.request, **again, **other), car) is SHORT
     for new in ({"source": built_in_sources()["staircase"]}, {"absent": frozenset(["jitter"])}):
         assert lane_of(replace(car.request, **new, **other), car) is GENERAL
@@ -126,12 +126,12 @@ def test_the_page_computes_what_is_faster_than_drawing(car):
         assert lane_of(replace(large.request, **change), large) is GENERAL
     file = compute(ask("sample"), None)
     assert lane_of(replace(file.request, **other), file) is PAGE
-    assert lane_of(replace(file.request, less=ReductionSettings(skip=2)), file) is GENERAL
+    assert lane_of(replace(file.request, reduction=ReductionSettings(skip=2)), file) is GENERAL
 
 
 def test_a_reduction_is_applied_to_the_whole_capture(car):
-    less = ReductionSettings(merge=2, gate_from=0.2, gate_to=0.9, pool=2, pulses=0.5)
-    reduced = compute(replace(car.request, less=less), car)
+    reduction = ReductionSettings(merge=2, gate_from=0.2, gate_to=0.9, pool=2, pulses=0.5)
+    reduced = compute(replace(car.request, reduction=reduction), car)
     assert reduced.whole is car.whole is car.capture
     assert reduced.capture.cube.shape == (32, 32, 35)
     assert compute(car.request, reduced).whole is car.whole
@@ -147,11 +147,11 @@ def test_a_reduction_is_applied_to_the_whole_capture(car):
 )
 def test_settings_and_reduction_describe_each_other(reduction):
     for n_bins in (100, 334, 876):
-        assert ReductionSettings.of(reduction, n_bins).reduction(n_bins) == reduction
+        assert ReductionSettings.of(reduction, n_bins).in_bins(n_bins) == reduction
 
 
 def test_a_gate_is_never_empty():
-    assert ReductionSettings(gate_from=1.0, gate_to=0.0).reduction(10) == Reduction(gate=(9, 10))
+    assert ReductionSettings(gate_from=1.0, gate_to=0.0).in_bins(10) == Reduction(gate=(9, 10))
 
 
 def test_an_estimate_is_what_core_computes(car):
@@ -887,14 +887,14 @@ def test_a_gate_is_cut_on_the_histogram_and_shown_in_the_unit_of_the_axes(layout
     (part,) = (each for each in layout.page.select(Part) if each.title == "Data reduction")
     part.collapsed = False
     gate = {name: control(layout, name) for name in ("Gate from", "Gate to", "T_n")}
-    state.less = ReductionSettings(merge=2)
+    state.reduction = ReductionSettings(merge=2)
     layout.next_answer()
     cut.box.left = 20  # of 100 bins, by the mouse
     layout.next_answer()
     cut.box.right = 90
     assert layout.next_answer().capture.acquisition.n_bins == 35
     layout.settle()
-    assert state.less == ReductionSettings(merge=2, gate_from=0.2, gate_to=0.9)
+    assert state.reduction == ReductionSettings(merge=2, gate_from=0.2, gate_to=0.9)
     histogram = explore.signals.histogram.figure
     assert (histogram.x_range.start, histogram.x_range.end) == (-10, 40)  # the whole gate
 

@@ -44,28 +44,28 @@ def tight(monkeypatch):
 
 def test_a_costly_capture_opens_reduced_and_says_so(source, tight):
     answer = compute(ask(source), None)
-    less = answer.request.less
-    assert less.merge * less.skip > 1
+    reduction = answer.request.reduction
+    assert reduction.merge * reduction.skip > 1
     assert answer.requested == ReductionSettings()
     assert answer.capture.cube.size < answer.whole.cube.size
     assert "limits of this server" in answer.capture.source
     # As few as will do: one step less is refused.
     for name in ("merge", "skip"):
-        if getattr(less, name) > 1:
-            more = replace(less, **{name: getattr(less, name) - 1})
+        if getattr(reduction, name) > 1:
+            more = replace(reduction, **{name: getattr(reduction, name) - 1})
             with pytest.raises(ValueError, match="working memory of 'tracking'"):
-                compute(ask(source, less=more), answer)
+                compute(ask(source, reduction=more), answer)
 
 
 def test_a_capture_that_fits_is_not_reduced(source):
     answer = compute(ask(source), None)
-    assert answer.request.less == answer.requested == ReductionSettings()
+    assert answer.request.reduction == answer.requested == ReductionSettings()
     assert answer.capture.cube.shape == (120, 120, 100)
 
 
 def test_the_controls_show_the_reduction(source, tight):
     session = Session({"wide": source})
-    assert session.state.less == session.answer.request.less != ReductionSettings()
+    assert session.state.reduction == session.answer.request.reduction != ReductionSettings()
     assert session.answer.request == session.estimate.request  # the next request asks for the same
 
 
@@ -79,7 +79,7 @@ def test_a_weaker_reduction_is_refused_with_a_remedy(source, tight):
 def test_time_is_limited_like_memory(source, monkeypatch):
     monkeypatch.setattr(budget, "REQUEST_S", 0.04)
     answer = compute(ask(source), None)
-    assert answer.request.less != ReductionSettings()
+    assert answer.request.reduction != ReductionSettings()
     with pytest.raises(ValueError, match="estimated time of 'tracking'"):
         compute(ask(source), answer)
 
@@ -87,9 +87,9 @@ def test_time_is_limited_like_memory(source, monkeypatch):
 def test_confidence_from_the_image_counts_for_the_limits(source, monkeypatch):
     monkeypatch.setattr(budget, "REQUEST_S", 0.4)
     judged = replace(ask(source), judged_by="image")
-    assert compute(ask(source), None).request.less == ReductionSettings()
+    assert compute(ask(source), None).request.reduction == ReductionSettings()
     answer = compute(judged, None)
-    assert answer.request.less != ReductionSettings()
+    assert answer.request.reduction != ReductionSettings()
     with pytest.raises(ValueError, match="estimated time of 'image_posterior'"):
         compute(judged, answer)
 
@@ -97,10 +97,12 @@ def test_confidence_from_the_image_counts_for_the_limits(source, monkeypatch):
 def test_groups_of_pulses_count_for_the_limits(monkeypatch):
     monkeypatch.setattr(budget, "REQUEST_S", 0.5)
     moving = Request(built_in_sources()["approach"], method="velocity")
-    assert compute(replace(moving, method="likelihood"), None).request.less == ReductionSettings()
+    assert (
+        compute(replace(moving, method="likelihood"), None).request.reduction == ReductionSettings()
+    )
     for judge in ("pixel", "image"):
         request = replace(moving, judged_by=judge)
-        assert compute(request, None).request.less != ReductionSettings()
+        assert compute(request, None).request.reduction != ReductionSettings()
 
 
 def test_computations_of_other_pages_are_limited(source, monkeypatch):

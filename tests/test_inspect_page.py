@@ -157,7 +157,7 @@ def test_a_file_opens_on_inspect_and_a_scene_on_explore(far, near):
 @pytest.mark.parametrize("name", ["far", "near"])
 def test_every_map_is_offered_where_possible_and_drawn(name, request):
     session = request.getfixturevalue(name)
-    change(session, less=ReductionSettings(skip=4))
+    change(session, reduction=ReductionSettings(skip=4))
     capture = session.answer.capture
     offered = session.state.param.map.objects
     has_truth = capture.truth_range_m is not None
@@ -236,10 +236,10 @@ def test_pixel_pins_and_region_are_kept_while_the_capture_keeps_its_pixels(near)
     near.choose_pixel(40, 31)
     near.state.param.update(pins=((40, 31),), region=rectangle((10, 20), (5, 8)))
     kept = (near.state.pixel, near.state.pins, near.state.region)
-    for less in (ReductionSettings(gate_from=0.1), ReductionSettings(pulses=0.5)):
-        change(near, less=less)
+    for reduction in (ReductionSettings(gate_from=0.1), ReductionSettings(pulses=0.5)):
+        change(near, reduction=reduction)
         assert (near.state.pixel, near.state.pins, near.state.region) == kept
-    change(near, less=ReductionSettings(pool=2))
+    change(near, reduction=ReductionSettings(pool=2))
     assert (near.state.pins, near.state.region) == ((), ())
 
 
@@ -538,7 +538,7 @@ def test_lengths_rest_on_a_guess_unless_the_user_sets_the_field_of_view(far):
     far.state.viewing = replace(far.state.viewing, field_of_view_deg=1.0)
     far.tasks.run_until(lambda: text.WIDTH_GUESSED not in section.note.text)
     far.state.crop = Crop(to_m=1.0)
-    change(far, less=ReductionSettings(gate_from=0.1))
+    change(far, reduction=ReductionSettings(gate_from=0.1))
     assert (far.state.viewing.field_of_view_deg, far.state.crop) == (1.0, Crop(to_m=1.0))
     change(far, source="building")
     assert far.state.crop == Crop()  # the limits were those of another scene
@@ -659,7 +659,7 @@ def test_estimates_of_other_sizes_are_not_subtracted(near):
     section = PairSection(near)
     section.show(True)
     press(button(section, "Keep as A"))
-    change(near, less=ReductionSettings(pool=2))
+    change(near, reduction=ReductionSettings(pool=2))
     section.refresh()
     near.tasks.run_until(lambda: "their sizes must be equal" in section.note.text)
     assert section.pair is None
@@ -783,7 +783,7 @@ def test_a_report_that_fails_removes_the_previous_one(capture, near, monkeypatch
         raise MemoryError("no more")
 
     monkeypatch.setattr("core.inspection.capture_report", fail)
-    near.state.less = ReductionSettings(merge=2)
+    near.state.reduction = ReductionSettings(merge=2)
     near.tasks.run_until(lambda: "MemoryError" in "".join(shown))
     assert capture.report is None
     assert capture.facts.facts == []
@@ -792,24 +792,24 @@ def test_a_report_that_fails_removes_the_previous_one(capture, near, monkeypatch
 
 
 def test_a_gate_is_applied_to_an_already_reduced_capture(near):
-    change(near, less=ReductionSettings(merge=2, gate_from=0.1))
+    change(near, reduction=ReductionSettings(merge=2, gate_from=0.1))
     answer = near.answer
     suggestion = replace(inspection.capture_report(answer.capture).suggestion, gate=(4, 40))
-    less, t_n = with_gate(answer, suggestion)
+    reduction, t_n = with_gate(answer, suggestion)
     n_bins = answer.whole.acquisition.n_bins
     opens = round(0.1 * n_bins)
-    assert less.reduction(n_bins).gate == (opens + 8, opens + 80)
-    assert less.merge == 2
+    assert reduction.in_bins(n_bins).gate == (opens + 8, opens + 80)
+    assert reduction.merge == 2
     assert t_n == max(answer.request.tracking.t_n - 4, 0)
 
 
 def test_a_gate_of_another_capture_is_not_cut(near):
     cut = Cut.of(near.answer, ReductionSettings())
-    before = near.state.less
+    before = near.state.reduction
     near.cut_gate(replace(cut, n_bins=cut.n_bins + 1, wanted=(0, cut.n_bins + 1)))
-    assert near.state.less is before
+    assert near.state.reduction is before
     near.cut_gate(replace(cut, wanted=(0, cut.n_bins // 2)))
-    assert near.state.less.gate(cut.n_bins) == (0, cut.n_bins // 2)
+    assert near.state.reduction.gate(cut.n_bins) == (0, cut.n_bins // 2)
 
 
 def test_accuracy_against_pulses_is_drawn_step_by_step(near):
@@ -838,9 +838,9 @@ def test_an_estimate_for_an_earlier_setting_does_not_reset_the_slider(capture, n
     for share in (0.5, 0.25):
         capture.pulses.value = share
     near.tasks.run_until(lambda: near.answer is not before)
-    earlier = replace(near.answer.request, less=ReductionSettings(pulses=0.5))
+    earlier = replace(near.answer.request, reduction=ReductionSettings(pulses=0.5))
     capture.follow(replace(near.answer, request=earlier))
-    assert (capture.pulses.value, near.state.less.pulses) == (0.25, 0.25)
+    assert (capture.pulses.value, near.state.reduction.pulses) == (0.25, 0.25)
 
 
 def test_a_share_of_pulses_that_fails_is_reset(capture, near, monkeypatch):
@@ -850,7 +850,7 @@ def test_a_share_of_pulses_that_fails_is_reset(capture, near, monkeypatch):
     monkeypatch.setattr("app.pages.shared.estimate.compute", fail)
     capture.pulses.value = 0.5
     near.tasks.run_until(lambda: capture.pulses.value == 1.0)
-    assert near.state.less == ReductionSettings()
+    assert near.state.reduction == ReductionSettings()
 
 
 def test_without_truth_accuracy_is_called_agreement(far):

@@ -182,7 +182,7 @@ def test_only_one_window_is_kept(path):
 
 
 @pytest.mark.parametrize(
-    "less",
+    "reduction",
     [
         ReductionSettings(),
         ReductionSettings(skip=2),
@@ -190,13 +190,13 @@ def test_only_one_window_is_kept(path):
         ReductionSettings(skip=3, pool=2),
     ],
 )
-def test_pixels_know_their_places_in_the_file(path, less):
+def test_pixels_know_their_places_in_the_file(path, reduction):
     window = Window((8, 90), (5, 120), 3)
-    answer = compute(ask(file_source(path), window=window, less=less), None)
+    answer = compute(ask(file_source(path), window=window, reduction=reduction), None)
     rows, cols = np.meshgrid(*window.picked, indexing="ij")
     images = np.stack([rows, cols], axis=2).astype(np.uint32)
     places = core.Capture(images, core.Acquisition(2), detection="all")
-    found = less.reduction(2).of(places).cube / less.pool**2
+    found = reduction.in_bins(2).of(places).cube / reduction.pool**2
     for row, col in ((0, 0), (2, 3)):
         place = answer.grid.place(row, col)
         np.testing.assert_allclose(place, found[row, col], atol=window.step)  # the middle of some

@@ -206,14 +206,14 @@ def test_another_capture_makes_the_study_outdated(section, session):
 def test_opening_the_papers_method_sets_the_sliders(measured):
     layout = Layout(small_sources())
     (point,) = (p for p in measured if p.candidate.method.estimator == "tracking")
-    merged = replace(point.candidate, reduction=ReductionSettings(merge=2).reduction(100))
+    merged = replace(point.candidate, reduction=ReductionSettings(merge=2).in_bins(100))
     measured_on = layout.session.answer.request
     changed = Illumination(sbr=1.0)
     layout.session.state.param.update(light=changed, source="staircase", page="Trade-off")
     show_point(layout.session, replace(point, candidate=merged), measured_on)
     state = layout.session.state
     assert (state.source, state.light) == ("small", Illumination())
-    assert (state.less, state.tracking) == (ReductionSettings(merge=2), merged.settings)
+    assert (state.reduction, state.tracking) == (ReductionSettings(merge=2), merged.settings)
     assert layout.pages.choice.value == "Explore"
     assert control(layout, "SBR").value == Illumination().sbr
     assert control(layout, "Preset").value == CUSTOM

@@ -87,7 +87,7 @@ def test_an_open_page_follows_with_its_settings_unless_it_should_not(tmp_path):
     )  # what a page that is opened later is offered
     layout = HeldLayout(served | built_in_sources(), arrivals=arrivals)
     session, state = layout.session, layout.session.state
-    state.param.update(pixel=(2, 5), method="coates", less=replace(state.less, merge=2))
+    state.param.update(pixel=(2, 5), method="coates", reduction=replace(state.reduction, merge=2))
     layout.tasks.run_until(session.is_settled)
 
     def arrive(number):
@@ -98,7 +98,7 @@ def test_an_open_page_follows_with_its_settings_unless_it_should_not(tmp_path):
 
     second = arrive(1)
     layout.tasks.run_until(lambda: session.answer.request.source is second)
-    assert (state.pixel, state.method, state.less.merge) == ((2, 5), "coates", 2)
+    assert (state.pixel, state.method, state.reduction.merge) == ((2, 5), "coates", 2)
     assert session.answer.capture.cube.shape == (6, 7, 20)
     (tmp_path / "bad.npz").write_bytes(b"no archive")
     arrivals.emit(folder.look() or folder.look())

@@ -1,8 +1,9 @@
 """Links: the state of a page as the query of its address, without values at their default.
 
-A parameter of `State` is written under its name, a field of one under both names, such as
-``light.sbr``: a string as it is, any other value as JSON. A link comes from outside: a value that
-the parameter or the dataclass rejects is described in a sentence, and the rest is used.
+A parameter of `State` is written under its name or that in `LINK_NAMES`, a field of one under both
+names, such as ``light.sbr``: a string as it is, any other value as JSON. A link comes from outside:
+a value that the parameter or the dataclass rejects is described in a sentence, and the rest is
+used.
 
 ``pn.state.location.sync`` (Panel 1.9.4) cannot do this: it raises TypeError for 7 of 19 parameters,
 writes every default, and drops values that are rejected without a message.
@@ -25,6 +26,9 @@ from core.io import ReadOptions
 
 OLD_SETTINGS, SETTINGS = "comparison.settings.", "settings."
 """Beginning of the settings' names in links of the last release, and the present one."""
+
+LINK_NAMES = {"reduction": "less"}
+"""Names in links of parameters that were renamed: links that people keep stay valid."""
 
 Result = TypeVar("Result")
 
@@ -51,7 +55,7 @@ def query_of(state: State, own: Mapping[str, Any]) -> str:
     """
     entries: dict[str, str] = {}
     for name, default in (defaults() | dict(own)).items():
-        entries |= _entries(name, getattr(state, name), default)
+        entries |= _entries(LINK_NAMES.get(name, name), getattr(state, name), default)
     return urlencode(entries, safe="[],:")
 
 
@@ -124,7 +128,8 @@ class Link:
         for name, base in bases.items():
             kind = getattr(State.param[name], "class_", None)
             is_absent = base is None and is_dataclass(kind)
-            value = self._created(name, kind) if is_absent else self._changed(name, base)
+            linked = LINK_NAMES.get(name, name)
+            value = self._created(linked, kind) if is_absent else self._changed(linked, base)
             if value is not base:
                 found |= self._attempt(_checked, name, value) or {}
         return found

@@ -51,7 +51,7 @@ def range_prior_of(answer: Answer) -> outputs.Plot:
 def slow_start(answer: Answer) -> str:
     """Return how far the small scale begins below the background; empty where it does not."""
     request = answer.request
-    is_whole = request.less == ReductionSettings()
+    is_whole = request.reduction == ReductionSettings()
     if answer.method != "tracking" or not request.source.is_scene or not is_whole:
         return ""
     return range_prior.slow_start(

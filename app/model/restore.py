@@ -108,7 +108,7 @@ def _restored_answer(
     before, changed = {**defaults(), **own}, choices(link, own)
     if changed["source"] not in sources:
         link.refused.append(text.source_is_gone(changed["source"], sources))
-        of_source = ("source", "reading", "window", "less")
+        of_source = ("source", "reading", "window", "reduction")
         changed = {name: value for name, value in changed.items() if name not in of_source}
     plain = {name: value for name, value in changed.items() if name not in COMPUTED_FROM}
     source = {name: value for name, value in changed.items() if name == "source"}

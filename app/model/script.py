@@ -83,7 +83,7 @@ def _imports(body: str) -> str:
 def _capture(answer: Answer) -> Lines:
     request = answer.request
     yield from _file(answer) if request.source.scene is None else _simulation(answer)
-    reduction = request.less.reduction(answer.whole.acquisition.n_bins)
+    reduction = request.reduction.in_bins(answer.whole.acquisition.n_bins)
     if changed := changed_fields(reduction):
         yield "\n# Reduce the capture."
         yield assign("reduction", "core.reductions.Reduction", **changed)

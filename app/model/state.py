@@ -214,7 +214,7 @@ class ReductionSettings(Settings):
         """Return the settings that keep some of `n_bins` bins, from `first` to before `end`."""
         return replace(self, gate_from=first / n_bins, gate_to=end / n_bins)
 
-    def reduction(self, n_bins: int) -> Reduction:
+    def in_bins(self, n_bins: int) -> Reduction:
         """Return the reduction for a capture with `n_bins` bins."""
         ends = self.gate(n_bins)
         gate = None if ends == (0, n_bins) else ends
@@ -392,7 +392,7 @@ class State(param.Parameterized):
         default=None,
         doc="Part of a capture larger than memory; None for its preview.",
     )
-    less = param.ClassSelector(class_=ReductionSettings, default=ReductionSettings())
+    reduction = param.ClassSelector(class_=ReductionSettings, default=ReductionSettings())
     absent: Any = Checked(
         frozenset(), _check_absent, doc="Parts and corrections that are switched off."
     )

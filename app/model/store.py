@@ -205,7 +205,7 @@ class Request:
     light: Illumination = field(default_factory=Illumination)
     reading: ReadOptions = field(default_factory=ReadOptions)
     tracking: TrackingParameters = field(default_factory=TrackingParameters)
-    less: ReductionSettings = field(default_factory=ReductionSettings)
+    reduction: ReductionSettings = field(default_factory=ReductionSettings)
     method: str = AUTOMATIC
     """Key of `core.ESTIMATORS`, or `AUTOMATIC`."""
     settings: Mapping[str, Any] = field(default_factory=default_settings, hash=False)
@@ -343,9 +343,9 @@ class Answer:
     @property
     def gate(self) -> ShownGate:
         """The gate of the capture as a part of the whole one."""
-        less = self.request.less
-        first, _ = less.gate(self.whole.acquisition.n_bins)
-        return ShownGate(self.capture.acquisition, first, less.merge)
+        reduction = self.request.reduction
+        first, _ = reduction.gate(self.whole.acquisition.n_bins)
+        return ShownGate(self.capture.acquisition, first, reduction.merge)
 
     @property
     def grid(self) -> Grid:
@@ -353,8 +353,8 @@ class Answer:
         if self.cutout is None:
             return Grid()
         rows, cols = self.cutout.window.picked
-        less = self.request.less
-        return Grid((rows[0], cols[0]), rows.step).thinned(less.skip, less.pool)
+        reduction = self.request.reduction
+        return Grid((rows[0], cols[0]), rows.step).thinned(reduction.skip, reduction.pool)
 
 
 def compute(request: Request, previous: Answer | None) -> Answer:
@@ -377,20 +377,20 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         whole = request.source.load(request)
     else:
         whole = previous.whole
-    requested = request.less
+    requested = request.reduction
     if is_new:
-        request = replace(request, less=_fitting(whole, request))
+        request = replace(request, reduction=_fitting(whole, request))
     if (
         previous is not None
         and whole is previous.whole
-        and _agree(request, previous.request, "less", "absent")
+        and _agree(request, previous.request, "reduction", "absent")
     ):
         capture, capture_s = previous.capture, previous.capture_s
     else:
         shape = _reduced_shape(whole, request)
         require_fitting(shape, *_costliest(whole, request, shape))
         capture = reduced(whole, request)
-        if request.less != requested:
+        if request.reduction != requested:
             source = f"{capture.source}; reduced to fit the limits of this server"
             capture = replace(capture, source=source)
         capture_s = perf_counter() - started
@@ -474,7 +474,7 @@ def _returns_cost(capture: Capture) -> Cost:
 
 def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:
     rows, cols, n_bins = whole.cube.shape
-    reduction = request.less.reduction(n_bins)
+    reduction = request.reduction.in_bins(n_bins)
     shape = rows, cols, n_bins
     return reduction.shape(shape) if reduction.fits(shape) else shape
 
@@ -498,10 +498,14 @@ def _fitting(whole: Capture, request: Request) -> ReductionSettings:
         return _costliest(whole, request, shape)[1]
 
     if fits(cost(_reduced_shape(whole, request))):
-        return request.less
+        return request.reduction
     rows, cols, n_bins = whole.cube.shape
-    found = fitting((rows, cols, n_bins), cost, request.less.reduction(n_bins))
-    return request.less if found is None else replace(request.less, merge=found[0], skip=found[1])
+    found = fitting((rows, cols, n_bins), cost, request.reduction.in_bins(n_bins))
+    return (
+        request.reduction
+        if found is None
+        else replace(request.reduction, merge=found[0], skip=found[1])
+    )
 
 
 def _cutout(request: Request, previous: Answer | None) -> Cutout | None:
@@ -516,7 +520,7 @@ def _cutout(request: Request, previous: Answer | None) -> Cutout | None:
 
 def reduced(whole: Capture, request: Request) -> Capture:
     """Return a capture with the reduction and without the corrections that are switched off."""
-    capture = request.less.reduction(whole.acquisition.n_bins).of(whole)
+    capture = request.reduction.in_bins(whole.acquisition.n_bins).of(whole)
     for name in CORRECTIONS:
         if name in request.absent:
             capture = without_correction(capture, name)
@@ -535,7 +539,7 @@ def same_capture(one: Request, other: Request) -> bool:
 
 def same_view(one: Request, other: Request) -> bool:
     """Whether the estimates of two requests have the same pixels and bins."""
-    kept = {replace(each.less, pulses=1.0) for each in (one, other)}
+    kept = {replace(each.reduction, pulses=1.0) for each in (one, other)}
     return _agree(one, other, "source", "reading", "window") and len(kept) == 1
 
 

@@ -308,7 +308,7 @@ class Layout:
         )
         self._panels: dict[str, SettingsPanel[Any]] = {
             name: SettingsPanel(type(getattr(state, name))(), partial(setattr, state, name))
-            for name in ("tracking", "less")
+            for name in ("tracking", "reduction")
         }
         self._panels["light"] = IlluminationPanel(state, lambda: session.request.illumination)
         self._budget = PhotonBudgetForm(session)
@@ -359,7 +359,9 @@ class Layout:
                 tracking.folded(MORE_TRACKING, *rare, is_open=is_open),
                 is_shown=False,
             ),
-            Shared.REDUCTION: part("Data reduction", self._panels["less"].layout, is_open=False),
+            Shared.REDUCTION: part(
+                "Data reduction", self._panels["reduction"].layout, is_open=False
+            ),
         }
 
     def _template(self) -> Template:
@@ -530,7 +532,7 @@ class Layout:
         whole = ShownGate(answer.whole.acquisition)
         self._panels["tracking"].controls["t_n"].follow(scale(unit, answer.gate))
         for name in ("gate_from", "gate_to"):
-            self._panels["less"].controls[name].follow(scale(unit, whole), whole.n_bins)
+            self._panels["reduction"].controls[name].follow(scale(unit, whole), whole.n_bins)
 
     def _show_reading(self, answer: Answer) -> None:
         refused = self.session.estimate.refused

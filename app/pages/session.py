@@ -209,9 +209,9 @@ class Session:
         n_bins = self.answer.whole.acquisition.n_bins
         if cut.n_bins != n_bins:
             return  # dragged before the capture changed
-        less = self.state.less.with_gate(*cut.wanted, n_bins)
-        if less != self.state.less:  # param would announce an equal object
-            self.state.less = less
+        reduction = self.state.reduction.with_gate(*cut.wanted, n_bins)
+        if reduction != self.state.reduction:  # param would announce an equal object
+            self.state.reduction = reduction
 
     def pick(self, index: int) -> None:
         """Show the pixel with this index in the flattened image; -1 is none."""

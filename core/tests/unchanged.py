@@ -191,15 +191,15 @@ def tracking(_: Path) -> Answers:
 
 
 def reductions(_: Path) -> Answers:
-    capture, less = CAPTURES["worn"](), core.reductions
-    yield "merge_bins", less.merge_bins(capture, 3)
-    yield "cut_gate", less.cut_gate(capture, 15, 70)
-    yield "skip_pixels", less.skip_pixels(capture, 2)
-    yield "pool_pixels", less.pool_pixels(capture, 3)
-    yield "first_pulses", less.first_pulses(capture, 200, seed=4)
-    yield "of all photons", less.first_pulses(photons(400), 100)
-    yield "of unknown pulses", less.share_of_pulses(photons(None), 0.3, seed=1)
-    several = less.Reduction(merge=2, gate=(4, 90), skip=2, pulses=0.5)
+    capture, reduce = CAPTURES["worn"](), core.reductions
+    yield "merge_bins", reduce.merge_bins(capture, 3)
+    yield "cut_gate", reduce.cut_gate(capture, 15, 70)
+    yield "skip_pixels", reduce.skip_pixels(capture, 2)
+    yield "pool_pixels", reduce.pool_pixels(capture, 3)
+    yield "first_pulses", reduce.first_pulses(capture, 200, seed=4)
+    yield "of all photons", reduce.first_pulses(photons(400), 100)
+    yield "of unknown pulses", reduce.share_of_pulses(photons(None), 0.3, seed=1)
+    several = reduce.Reduction(merge=2, gate=(4, 90), skip=2, pulses=0.5)
     reduced = several.of(CAPTURES["car"]())
     yield "several", reduced
     image = core.estimate(reduced, "matched_filter")
@@ -209,9 +209,9 @@ def reductions(_: Path) -> Answers:
 def corrections(_: Path) -> Answers:
     capture = drawn(some_of("car"), 0.3, 0.15, seed=11)
     for correction in core.CORRECTIONS:
-        less = core.without_correction(capture, correction)
+        without = core.without_correction(capture, correction)
         for method in ("likelihood", "coates", "kde"):
-            yield f"{correction}, {method}", core.estimate(less, method)
+            yield f"{correction}, {method}", core.estimate(without, method)
     scene = everything()
     for part in core.parts_of(scene):
         yield f"without {part}", drawn(core.without(scene, part), 0.5, 0.5).counts

@@ -304,7 +304,7 @@ class Explore(Section):
         numbers = text.pixel_numbers(answer, pixel, state.unit)
         with self.session.tasks.hold():
             self.image.fit(*answer.capture.shape, answer.grid)
-            self.signals.cut.update(Cut.of(answer, state.less))
+            self.signals.cut.update(Cut.of(answer, state.reduction))
             self.signals.update(pixel, answer.gate, state.difference, state.unit)
             self.zoom.follow(answer.capture, pixel.answer_bin)
             if self._prior_axes is not None:

@@ -115,7 +115,7 @@ class CaptureSection(Section):
             return
         answer = self.session.answer
         # The estimate may be that of an earlier setting.
-        self.pulses.value = self.session.state.less.pulses
+        self.pulses.value = self.session.state.reduction.pulses
         if self._reported is None or answer.capture is not self._reported.capture:
             self.flux.text = COMPUTING
         # Counts come at once, the flux later.
@@ -130,14 +130,14 @@ class CaptureSection(Section):
 
     def _reduce(self, pulses: float) -> None:
         state = self.session.state
-        if pulses != state.less.pulses:
-            state.less = replace(state.less, pulses=pulses)
+        if pulses != state.reduction.pulses:
+            state.reduction = replace(state.reduction, pulses=pulses)
 
     def _apply_gate(self) -> None:
         if self.report is not None and self._reported is not None:
-            less, t_n = with_gate(self._reported, self.report.suggestion)
+            reduction, t_n = with_gate(self._reported, self.report.suggestion)
             state = self.session.state
-            state.param.update(less=less, tracking=replace(state.tracking, t_n=t_n))
+            state.param.update(reduction=reduction, tracking=replace(state.tracking, t_n=t_n))
 
     def _apply_t_n(self) -> None:
         if self.report is not None:
@@ -149,8 +149,8 @@ class CaptureSection(Section):
     @property
     def _study_settings(self) -> Any:
         answer = self.session.answer
-        less = replace(answer.request.less, pulses=1.0)
-        return answer.whole, less, answer.method, answer.settings
+        reduction = replace(answer.request.reduction, pulses=1.0)
+        return answer.whole, reduction, answer.method, answer.settings
 
     @property
     def _all_pulses(self) -> int:
@@ -190,7 +190,7 @@ class CaptureSection(Section):
 
     def _mark_present(self) -> None:
         """Mark the number of pulses that is used at present."""
-        present = self.session.answer.request.less.pulses * self._all_pulses
+        present = self.session.answer.request.reduction.pulses * self._all_pulses
         self.accuracy.mark("present", present)
         marks = plots.marks(inspect_plots.NAMES, present=present)
         self.accuracy.keep(self.accuracy.figure.xaxis.axis_label, self._points + marks)

@@ -208,7 +208,7 @@ class PixelSection(Section):
     def _draw(self, found: Inspected) -> None:
         state = self.session.state
         with_fit = state.plot == "Fit"
-        self.plots.cut.update(Cut.of(found.answer, state.less))
+        self.plots.cut.update(Cut.of(found.answer, state.reduction))
         below = self.plots.update(found, state.unit, state.plot)
         self.zoom.follow(found.answer.capture, found.pixel.answer_bin)
         if below not in self.cards:

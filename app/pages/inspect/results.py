@@ -125,7 +125,7 @@ def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
     def step() -> Accuracy:
         if not started:  # on the worker thread, since restoring all pulses may take long
             request, chosen = answer.request, (answer.method, answer.settings)
-            all_pulses = replace(request, less=replace(request.less, pulses=1.0))
+            all_pulses = replace(request, reduction=replace(request.reduction, pulses=1.0))
             capture = reduced(answer.whole, all_pulses)
             started.append(inspection.accuracy_over_pulses(capture, SHARES, *chosen))
         return next(started[0])
@@ -135,11 +135,11 @@ def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
 
 def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[ReductionSettings, int]:
     """Return the reduction that crops to the suggested gate, and T_n at its old place."""
-    less, n_bins = answer.request.less, answer.whole.acquisition.n_bins
-    opens, _ = less.gate(n_bins)
-    first, end = (opens + less.merge * edge for edge in suggestion.gate)
+    reduction, n_bins = answer.request.reduction, answer.whole.acquisition.n_bins
+    opens, _ = reduction.gate(n_bins)
+    first, end = (opens + reduction.merge * edge for edge in suggestion.gate)
     t_n = max(answer.request.tracking.t_n - suggestion.gate[0], 0)
-    return less.with_gate(first, min(end, n_bins), n_bins), t_n
+    return reduction.with_gate(first, min(end, n_bins), n_bins), t_n
 
 
 @dataclass(frozen=True)

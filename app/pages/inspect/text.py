@@ -211,7 +211,7 @@ def estimate_name(answer: Answer) -> str:
     request = answer.request
     light = (request.illumination,) if request.source.is_scene else ()
     names = [request.source.title, method_title(answer.method)]
-    for settings in (*light, request.less, answer.settings):
+    for settings in (*light, request.reduction, answer.settings):
         names += changed_settings(settings)
     return ", ".join(names)
 

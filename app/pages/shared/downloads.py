@@ -311,7 +311,7 @@ def looked_at(session: Session, request: Request) -> Subject:
     part = ""
     if window is not None:
         part = _part(*((first, end - 1) for first, end in (window.rows, window.cols)))
-    return Subject(capture + absent, settings=(*simulated, request.less), part=part)
+    return Subject(capture + absent, settings=(*simulated, request.reduction), part=part)
 
 
 def _part(rows: tuple[int, int], cols: tuple[int, int]) -> str:

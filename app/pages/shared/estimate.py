@@ -109,9 +109,9 @@ class CurrentEstimate:
 
     def _take_reduction(self, answer: Answer) -> None:
         """Show the reduction that was added to keep the request within its limits."""
-        if self._state.less == answer.requested != answer.request.less:
+        if self._state.reduction == answer.requested != answer.request.reduction:
             with param.discard_events(self._state):
-                self._state.less = answer.request.less
+                self._state.reduction = answer.request.reduction
 
     def _restore(self, request: Request, error: Exception) -> None:
         """Return to the request that the page still shows, unless the user has moved on."""

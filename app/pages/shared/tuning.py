@@ -100,7 +100,7 @@ class SettingsChooser:
 
 def _same_subject(request: Request, now: Request) -> bool:
     """Whether settings chosen for a request hold for another one."""
-    same = same_capture(request, now) and request.less == now.less
+    same = same_capture(request, now) and request.reduction == now.reduction
     return same and request.absent == now.absent and request.method == now.method
 
 

@@ -270,10 +270,12 @@ def show_point(session: Session, point: Point, measured_on: Request) -> None:
     """Show a measured configuration on Explore."""
     state, candidate = session.state, point.candidate
     method, settings = candidate.method.estimator, candidate.settings
-    less = ReductionSettings.of(candidate.reduction, point.shape[2])
+    reduction = ReductionSettings.of(candidate.reduction, point.shape[2])
     kept: dict[str, Any] = {"tracking": state.tracking, "settings": state.settings}
     kept["returns"] = MOST_PROBABLE if candidate.returns == 1 else ALL_RETURNS
-    request = replace(measured_on, less=less, method=method, **kept).with_settings(settings)
+    request = replace(measured_on, reduction=reduction, method=method, **kept).with_settings(
+        settings
+    )
     state.param.update(page="Explore", **parameters_of(request, session.sources))
 
 
