@@ -2,9 +2,10 @@
 
 At a low SBR single pixels cannot distinguish an echo from background, and the signal level
 estimated from them collapses. Neighbouring pixels that see one surface act like one pixel with more
-pulses. The levels are therefore estimated with 1 x 1 to 4 x 4 pixels added, and those are kept that
-make neighbours agree most. With the posteriors q of two pixels by themselves, the prior p and a
-Laplace density K of scale a, the pair is ::
+pulses. Unless pixels by themselves tell where their surfaces are, the levels are therefore
+estimated with 1 x 1 to 4 x 4 pixels added, and those are kept that make neighbours agree most. With
+the posteriors q of two pixels by themselves, the prior p and a Laplace density K of scale a, the
+pair is ::
 
     c = Σ q(d) K(d - d') q'(d') / p(d')
 
@@ -27,7 +28,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
 
 from core.acquisition import MOST_PULSES, Floats
@@ -41,17 +41,22 @@ from core.inference.flux import (
 from core.inference.flux_model import UNRELATED, Agreement, FluxModel, FluxPrior
 from core.inference.likelihood import prepare, prepared_groups
 from core.inference.posterior import States, states_of
+from core.kernels.messages import MOST_TAPS, fill_lags
+from core.kernels.parallel import on_threads
 from core.reductions import merge_bins, pool_pixels
 
 _SIDES = (1, 2, 3, 4)  # of the tiles whose pixels are added
 FEWEST_PIXELS = 64
 """Pixels, or tiles, from which distributions are learned."""
 
+SCALES_BINS = (0.3, 0.6, 1.2, 2.4)
+"""Scales of the Laplace density that are tried."""
+
 _MOST_COUNT = 2**32 // max(_SIDES) ** 2
 _PAIRS = 1024  # pixels whose right and lower neighbours are compared
-_SCALES_BINS = (0.3, 0.6, 1.2, 2.4)
 _SHARES = np.linspace(0.0, 0.95, 39)
 _SURE = 3.0  # standard errors
+_FEW_BINS = 2.0  # among which a pixel hesitates that tells by itself where its surface is
 _ECHO_BINS = 4  # merged bins of an echo; more add no information
 _LEAST_SHARE = 1e-6  # of the pixels
 _LEAST_DEPTH = 0.3  # relative to a uniform prior; fewer pixels teach depths than are estimated
@@ -69,14 +74,18 @@ class _Found(NamedTuple):
 @cached_per_capture
 def image_model_of(capture: Capture) -> FluxModel:
     """Estimate flux and smoothness of a capture from its pixels and their neighbours."""
-    merged, factor = merged_bins(capture)
     found = of_tiles = _Found(UNRELATED, flux_model_of(capture))
     for prior, tiles in _flux_priors(capture):
         flux = flux_model_with(capture, prior)
-        here = _agreement(merged, merged_flux(flux, factor))
-        found = max(found, _Found(here, flux), key=_gain)
+        pairs = Pairs.of(capture, flux)
+        if pairs is None:
+            break
+        found = max(found, _Found(pairs.agreement(), flux), key=_gain)
+        if pairs.are_clear():
+            break
         if tiles is not None and found.agreement.alike == 0:
-            here = _agreement(merged_bins(tiles)[0], merged_flux(flux_model_of(tiles), factor))
+            pairs = Pairs.of(tiles, flux_model_of(tiles))
+            here = UNRELATED if pairs is None else pairs.agreement()
             of_tiles = max(of_tiles, _Found(here, flux), key=_gain)
     best, flux = of_tiles if found.agreement.alike == 0 else found
     depth = tempered(flux.depth) if best.alike > 0 else flux.depth
@@ -148,33 +157,70 @@ def _flux_priors(capture: Capture) -> Iterator[tuple[FluxPrior, Capture | None]]
         yield per_pixel, replace(pooled, flux_prior=prior)
 
 
-def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
-    """Find how similar neighbours are under a flux model."""
-    rows, cols = capture.shape
-    if min(rows, cols) < 2 or rows * cols < FEWEST_PIXELS:
-        return UNRELATED
-    at = np.random.default_rng(0).permutation((rows - 1) * (cols - 1))[:_PAIRS]
-    one = at // (cols - 1) * cols + at % (cols - 1)
-    found = states_of_pixels(capture, flux, np.concatenate([one, one + 1, one + cols]))
-    prior = Prior.of(flux)
-    q = found.surface.reshape(3, one.size, -1).astype(float)
-    dark = found.nothing.reshape(3, one.size).astype(float)
-    apart = one.size // 2  # pixels are in random order
-    by_chance = np.roll(q[1:], apart, axis=1), np.roll(dark[1:], apart, axis=1)
-    best, chance = UNRELATED, 0.0
-    for scale in _SCALES_BINS:
-        smooth = scipy.ndimage.correlate1d(q[0], laplace(scale), mode="constant") / prior.surface
+class Pairs(NamedTuple):
+    """Posteriors of some pixels by themselves, and of their right and lower neighbours."""
 
-        def ratios(surface: Floats, nothing: Floats, smooth: Floats = smooth) -> Floats:
-            return np.asarray(np.vecdot(smooth, surface) + dark[0] * nothing / prior.nothing)
+    surface: NDArray[np.float32]
+    """Shape (pixel or neighbour, pair, bin)."""
+    nothing: Floats
+    """Shape (pixel or neighbour, pair)."""
+    prior: Prior
 
-        chance = max(chance, float(_likeliest_share(ratios(*by_chance))[1].mean()))
-        share, gain = _likeliest_share(ratios(q[1:], dark[1:]))
-        mean, error = float(gain.mean()), float(gain.std()) / math.sqrt(gain.size)
-        if mean > max(best.gain, _SURE * error):
-            best = Agreement(mean, share, scale)
-    left = best.gain - chance
-    return best._replace(gain=left) if left > 0.5 * best.gain else UNRELATED
+    @classmethod
+    def of(cls, capture: Capture, flux: FluxModel) -> Pairs | None:
+        """Choose pairs and compute their posteriors; None if there are too few."""
+        capture, factor = merged_bins(capture)
+        flux, (rows, cols) = merged_flux(flux, factor), capture.shape
+        if min(rows, cols) < 2 or rows * cols < FEWEST_PIXELS:
+            return None
+        at = np.random.default_rng(0).permutation((rows - 1) * (cols - 1))[:_PAIRS]
+        one = at // (cols - 1) * cols + at % (cols - 1)
+        found = states_of_pixels(capture, flux, np.concatenate([one, one + 1, one + cols]))
+        surface = found.surface.reshape(3, one.size, -1)
+        nothing = found.nothing.reshape(3, one.size).astype(float)
+        return cls(surface, nothing, Prior.of(flux))
+
+    def are_clear(self) -> bool:
+        """Return whether pixels with a surface tell by themselves where it is.
+
+        A pixel hesitates among ``1 / Σ q(d)²`` bins. Where levels collapse, hardly any pixel has a
+        surface, and those hesitate among three bins or more.
+        """
+        each = self.surface.astype(float)  # whose squares are numbers, too
+        surface = each.sum(axis=2)
+        n_bins = surface**2 / np.vecdot(each, each)
+        mean = math.exp(np.average(np.log(n_bins), weights=surface))
+        return mean < _FEW_BINS and float(surface.sum()) >= FEWEST_PIXELS
+
+    def agreement(self) -> Agreement:
+        """Find how similar neighbours are."""
+        apart = self.nothing.shape[1] // 2  # pixels are in random order
+        ratios = self.ratios(0)
+        by_chance = self.ratios(apart)
+        best, chance = UNRELATED, 0.0
+        for scale, ratio, random in zip(SCALES_BINS, ratios, by_chance, strict=True):
+            chance = max(chance, float(_likeliest_share(random)[1].mean()))
+            share, gain = _likeliest_share(ratio)
+            mean, error = float(gain.mean()), float(gain.std()) / math.sqrt(gain.size)
+            if mean > max(best.gain, _SURE * error):
+                best = Agreement(mean, share, scale)
+        left = best.gain - chance
+        return best._replace(gain=left) if left > 0.5 * best.gain else UNRELATED
+
+    def ratios(self, apart: int) -> Floats:
+        """Compute c of each scale and of pixels and the neighbours of others, (scale, pair)."""
+        other = np.roll(self.surface[1:], apart, axis=1) / self.prior.surface.astype(np.float32)
+        lags = np.empty((*other.shape[:2], MOST_TAPS), np.float32)
+        for neighbour, of_neighbour in zip(other, lags, strict=True):
+            work = neighbour.size * MOST_TAPS
+            on_threads(fill_lags, len(neighbour), work, self.surface[0], neighbour, of_neighbour)
+        kernels = np.zeros((len(SCALES_BINS), MOST_TAPS))
+        for scale, kernel in zip(SCALES_BINS, kernels, strict=True):
+            filled = laplace(scale)
+            beyond = (MOST_TAPS - filled.size) // 2
+            kernel[beyond : beyond + filled.size] = filled
+        dark = self.nothing[0] * np.roll(self.nothing[1:], apart, axis=1) / self.prior.nothing
+        return np.asarray(kernels @ lags.reshape(-1, MOST_TAPS).T + dark.ravel())
 
 
 def _likeliest_share(ratio: Floats) -> tuple[float, Floats]:

@@ -66,6 +66,8 @@ _UNLIKELY = 0.1  # probability of a surface below which its signal level is unkn
 _FALSE_PIXELS = 0.5  # of an image, that may get a range whatever the share of empty ones
 _ALONG_PLANES = 0.8, 0.2  # ρ and the scale of K in bins
 _LEAST_WEIGHT = 1e-9  # of a window; 0 would have no share on a plane
+_PASSES = 8  # over the bins of a pixel, for a message
+_OPERATIONS = 25  # for a pixel of the window and each distance from the plane
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
 
@@ -217,7 +219,8 @@ def _pass_messages(
     """Fill `posterior` with that given the other pixels of the row, or of the column."""
     n_lines = evidence.nothing.shape[0 if along_rows else 1]
     given = *evidence, slope, along_rows, link, *posterior
-    on_threads(fill_posterior, n_lines, evidence.surface.size, *given)
+    work = 2 * _PASSES * evidence.surface.size  # forward and backward
+    on_threads(fill_posterior, n_lines, work, *given)
 
 
 def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:
@@ -236,7 +239,7 @@ def slopes_of(delay: Floats, weight: Floats) -> NDArray[np.float32]:
 def planes(delay: Floats, weight: Floats) -> NDArray[np.float32]:
     """Find the plane of each pixel: delay, change per row and change per column (3, row, col)."""
     (rows, cols), size = delay.shape, 2 * _HALF + 1
-    beyond, work = -cols % LANES, delay.size * size**2
+    beyond, work = -cols % LANES, _OPERATIONS * delay.size * size**2
 
     def wide(image: Floats | NDArray[np.float32]) -> NDArray[np.float32]:
         inner, around = image[..., :cols].astype(np.float32), [(0, 0)] * (image.ndim - 2)

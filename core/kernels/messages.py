@@ -132,6 +132,21 @@ def fill_posterior(  # type: ignore[no-untyped-def]
             on_nothing = _pass_on(weights, h, total, -slopes[at], link, taps, sums, message)
 
 
+@njit(**SUMMING)
+def fill_lags(first, end, one, other, lags):  # type: ignore[no-untyped-def]
+    """Fill ``Σ_d one(d + lag) other(d)`` of each pixel and lag, (pixel, lag); 0 is in the middle.
+
+    `one` and `other` are of shape (pixel, bin).
+    """
+    n_bins, half = one.shape[1], lags.shape[1] // 2
+    for i in range(first, end):
+        for lag in range(-half, half + 1):
+            total = np.float32(0.0)
+            for d in range(max(0, -lag), min(n_bins, n_bins - lag)):
+                total += one[i, d + lag] * other[i, d]
+            lags[i, lag + half] = total
+
+
 @njit(**COMPILED)
 def fill_modes(first, end, posterior, delay, weight):  # type: ignore[no-untyped-def]
     """Fill the likeliest `delay` of each pixel in bins, refined by a parabola, and its `weight`.
@@ -142,9 +157,14 @@ def fill_modes(first, end, posterior, delay, weight):  # type: ignore[no-untyped
     n_bins = posterior.shape[1]
     for i in range(first, end):
         here = posterior[i]
-        best = 0
+        # Positive numbers are ordered as their bits, of which the largest is found by vectors.
+        bits = here.view(np.int32)
+        highest = bits[0]
         for d in range(1, n_bins):
-            best = d if here[d] > here[best] else best
+            highest = max(highest, bits[d])
+        best = 0
+        while bits[best] < highest:
+            best += 1
         shift, mass = 0.0, here[best]
         if 0 < best < n_bins - 1:
             mass += here[best - 1] + here[best + 1]

@@ -12,13 +12,17 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
 from core.estimators.image_model import (
+    SCALES_BINS,
+    Pairs,
     Prior,
     image_model_of,
+    laplace,
     merged_bins,
     merged_flux,
     tempered,
 )
 from core.estimators.image_posterior import Link, image_posterior_of, least_probability, planes
+from core.inference.flux import detailed_flux_prior_of, flux_model_with
 from core.inference.flux_model import FluxModel
 from core.inspection import pixel_report
 from core.kernels.blocks import LANES
@@ -119,6 +123,45 @@ def test_neighbours_raise_the_restoration_degree() -> None:
 def test_a_wall_is_found_that_pairs_of_pixels_do_not_show() -> None:
     for seed in (905, 906):  # of eight captures, the two without agreement of pairs of pixels
         assert degree(Condition("wall", 0.02), "image_posterior", seed) > 0.9
+
+
+@pytest.mark.parametrize("apart", [0, 2])
+def test_pairs_are_as_likely_with_one_surface_as_the_equation_says(apart: int) -> None:
+    rng, n_pairs, n_bins = np.random.default_rng(0), 5, 40
+    states = rng.exponential(size=(3, n_pairs, n_bins + 1)) ** 4
+    states /= states.sum(axis=2, keepdims=True)
+    surface, nothing = states[..., :-1], states[..., -1]
+    depth = rng.uniform(0.5, 1.5, n_bins)
+    prior = Prior(0.8 * depth / depth.sum(), 0.2)
+    found = Pairs(surface.astype(np.float32), nothing, prior).ratios(apart)
+    other, dark = (np.roll(each[1:], apart, axis=1) for each in (surface, nothing))
+    for scale, of_scale in zip(SCALES_BINS, found, strict=True):
+        kernel = laplace(scale)
+        smooth = np.array([np.convolve(each, kernel, "full") for each in surface[0]])
+        smooth = smooth[:, kernel.size // 2 :][:, :n_bins]
+        expected = (smooth * other / prior.surface).sum(axis=2) + nothing[0] * dark / 0.2
+        np.testing.assert_allclose(of_scale, expected.ravel(), rtol=1e-5)  # of float32
+
+
+@pytest.mark.parametrize(
+    "pairs, bins_likely, clear", [(64, 1, True), (64, 3, False), (16, 1, False)]
+)
+def test_pixels_are_clear_that_hesitate_among_few_bins(
+    pairs: int, bins_likely: int, clear: bool
+) -> None:
+    surface = np.zeros((3, pairs, 20), np.float32)
+    surface[:, ::2, 5 : 5 + bins_likely] = 1 / bins_likely
+    surface[:, 1::2] = 1e-20  # sees no surface, and does not count
+    prior = Prior(np.full(20, 0.04), 0.2)
+    assert Pairs(surface, 1.0 - surface.sum(axis=2), prior).are_clear() == clear
+
+
+@pytest.mark.compiled
+def test_neighbours_are_added_only_where_pixels_are_not_clear() -> None:
+    for sbr, clear in ((0.1, True), (0.015, False)):
+        capture = Condition("net", sbr).capture(900)
+        own = flux_model_with(capture, detailed_flux_prior_of(capture))
+        assert np.array_equal(image_model_of(capture).share, own.share) == clear
 
 
 @pytest.mark.compiled
