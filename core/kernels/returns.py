@@ -451,6 +451,19 @@ def _fill_rate(i, model, background, signal, delay, rate):  # type: ignore[no-un
 
 
 @njit(**COMPILED)
+def _fill_more(i, model, background, signal, delay, more):  # type: ignore[no-untyped-def]
+    """Fill ``exp(rate) - 1`` for first photons, else the rate, of each bin; see `_fill_rate`."""
+    _fill_rate(i, model, background, signal, delay, more)
+    if model.is_first:
+        rate, of_rate = 0.0, 0.0
+        for k in range(more.size):
+            if more[k] != rate:  # mostly as before, and exponentials are slow
+                rate = more[k]
+                of_rate = math.expm1(rate)
+            more[k] = of_rate
+
+
+@njit(**COMPILED)
 def _add_tap(photons, gain, fired, unfired, per_more, log):  # type: ignore[no-untyped-def]
     """Add to `log` what the bins (n,) that one tap of an echo meets add to ℓ."""
     for d in range(log.size):
@@ -477,19 +490,21 @@ def _fill_further(i, counts, model, background, signal, delay, levels, log):  # 
     if model.is_first:  # a count adds -μ to its logarithm
         for k in pixel.fired:
             exposure += pixel.counts[k] * model.background[k]
-    _fill_rate(i, model, background[i], signal, delay, before)
+    _fill_more(i, model, background[i], signal, delay, before)
     for k in range(n_bins):
-        before[k] = 1.0 / (math.expm1(before[k]) if model.is_first else before[k])
+        before[k] = 1.0 / before[k]
     for level in range(len(levels)):
         s = levels[level, i]
         left = max(background[i] - s, 0.1 * background[i])
-        _fill_rate(i, model, left, signal, delay, after)
-        base = (background[i] - left) * exposure
+        _fill_more(i, model, left, signal, delay, after)
+        base, ratio, gained = (background[i] - left) * exposure, 1.0, 0.0
         for k in range(n_bins):
-            after[k] = math.expm1(after[k]) if model.is_first else after[k]
             per_more[k] = 1.0 / after[k]
         for k in pixel.fired:
-            base += pixel.counts[k] * math.log(after[k] * before[k])
+            if after[k] * before[k] != ratio:  # mostly as before, and logarithms are slow
+                ratio = after[k] * before[k]
+                gained = math.log(ratio)
+            base += pixel.counts[k] * gained
         for k in range(n_bins):
             one[k] = base
         for tap in range(n_taps):
@@ -555,13 +570,16 @@ def _fill_photons(i, counts, model, background, signal, delay, photons, exposure
     pixel, rate, n_taps = _pixel(counts, model), np.empty(counts.size), model.echo.shape[1]
     _fill_rate(i, model, background[i], signal, delay, rate)
     photons[0, i], exposure[0, i] = 0.0, 0.0
-    armed = model.n_pulses
+    armed, of_rate, photons_each = model.n_pulses, 0.0, 1.0
     for k in range(counts.size):
         seen = pixel.counts[k]
         exposure[0, i] += (armed if model.is_first else 1.0) * model.background[k]
         if model.is_first:
             armed -= seen
-            seen *= rate[k] / -math.expm1(-rate[k]) if seen > 0 else 0.0
+            if rate[k] != of_rate:  # mostly as before
+                of_rate = rate[k]
+                photons_each = of_rate / -math.expm1(-of_rate)
+            seen *= photons_each
         rate[k] = seen / rate[k]  # photons relative to those expected
         photons[0, i] += background[i] * model.background[k] * rate[k]
     for j in range(len(signal)):
