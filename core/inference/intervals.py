@@ -3,10 +3,12 @@
 Given that a surface lies within `TOLERANCE_BINS` of an estimate, the probability of which is the
 confidence, its delay ``d`` has the posterior density ::
 
-    p(d) ∝ depth(d) Σ_l share_l L_l(d)
+    p(d) ∝ Σ_l share_l L_l(d)
 
 over the signal levels ``l`` of `core.inference.flux`, with the likelihood ``L_l`` of the whole
-histogram (`core.inference.likelihood`). The levels are a grid, whose errors would bias intervals of
+histogram (`core.inference.likelihood`). Delays near the estimate are as likely before: how the
+delays of the image are distributed is learned from the same photons, and would count those of the
+pixel twice. The levels are a grid, whose errors would bias intervals of
 many photons: signal and background of each are fitted to the pixel. What the fit leaves uncertain
 makes the delay uncertain, too: the density is raised to the power ``1 / ψ``, where ψ is the
 variance of the delay with unknown fluxes over that with known ones, by the Fisher information. The
@@ -206,8 +208,8 @@ class _Window(NamedTuple):
     """Per bin, likewise."""
     log_weight: Floats
     """Logarithm of the prior probability of the level, likewise."""
-    depth: Floats
-    """`FluxModel.depth`."""
+    n_bins: int
+    """Bins of the gate."""
 
     def some(self, pixels: NDArray[np.bool_]) -> _Window:
         """Return the window of some pixels."""
@@ -262,7 +264,7 @@ def _window(capture: Capture, pixels: NDArray[np.intp], estimate_bin: Floats) ->
         signal,
         background / n_bins * here,
         np.broadcast_to(log_share, signal.shape),
-        flux.depth,
+        n_bins,
     )
 
 
@@ -301,13 +303,11 @@ def _dispersion(window: _Window, delay: Floats) -> Floats:
 
 def _log_density(window: _Window, delay: Floats) -> Floats:
     """Logarithm of ``p(d)`` up to a constant of each pixel, at delays (pixel, node)."""
-    log = np.logaddexp.reduce(_log_levels(window, _share(window, delay)))
-    at = np.clip(delay.astype(np.intp), 0, window.depth.size - 1)
-    return np.asarray(log + np.log(window.depth)[at])
+    return np.asarray(np.logaddexp.reduce(_log_levels(window, _share(window, delay))))
 
 
 def _log_levels(window: _Window, share: Floats) -> Floats:
-    """Logarithm of the contribution of each level to ``p(d)`` but for `depth`.
+    """Logarithm of the contribution of each level to ``p(d)``.
 
     From `_share` (pixel, node, bin), shape (level, pixel, node).
     """
@@ -335,7 +335,7 @@ def _fitted(window: _Window, share: Floats) -> _Window:
     """
     p, fired, unfired = share[:, 0], window.fired, window.unfired
     signal, background = window.signal, window.background
-    n_bins, precision = window.depth.size, _flux_precision(signal)
+    n_bins, precision = window.n_bins, _flux_precision(signal)
     s, b = signal, background
     for _ in range(_FITTING_STEPS):
         rate = b[..., np.newaxis] + s[..., np.newaxis] * p
@@ -382,7 +382,7 @@ def _flux_widening(window: _Window, delay: Floats, share: Floats) -> Floats:
     dd, ds, db = (np.vecdot(information, d * each) for each in (d, p, 1.0))
     ss = np.vecdot(information, p**2) + precision
     sb = np.vecdot(information, p)
-    bb = information.sum(axis=1) + precision * window.depth.size**2
+    bb = information.sum(axis=1) + precision * window.n_bins**2
     lost = (bb * ds**2 - 2 * sb * ds * db + ss * db**2) / (ss * bb - sb**2)
     known = 1 - lost / np.maximum(dd, np.finfo(float).tiny)
     return np.asarray(1 / np.maximum(known, _LEAST_KNOWN))[:, np.newaxis]
@@ -406,8 +406,10 @@ def _zoomed(window: _Window, low: Floats, high: Floats, widening: Floats) -> tup
         inside = log > -_DROP
         first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
         last = np.minimum(_NODES - np.argmax(inside[:, ::-1], axis=1), _NODES - 1)
-        if (3 * (last - first) >= 2 * _NODES).all():
+        is_filled = 3 * (last - first) >= 2 * _NODES
+        if is_filled.all():
             break
-        ends = np.stack([first, last], axis=1)
-        low, high = np.take_along_axis(delay, ends, axis=1).T
+        # Each pixel stops by itself, so that it does not matter which others are computed.
+        ends = np.stack([np.where(is_filled, 0, first), np.where(is_filled, -1, last)], axis=1)
+        low, high = np.take_along_axis(delay, ends % _NODES, axis=1).T
     return delay, np.exp(log)
