@@ -259,6 +259,8 @@ class _Mixture:
         top = 2 * float(known.levels[-1])
         count = int(np.clip(math.ceil(2 * math.sqrt(top * n_pulses)), 12, 40))
         self._levels = np.linspace(0.0, math.sqrt(top), count + 1) ** 2
+        # Photons of the strongest echo determine its delay; between two, it would seem longer.
+        self._steps = max(_STEPS[0], _STEPS[1] * math.sqrt(top / 2 * n_pulses))
         self._known = known._replace(
             levels=self._levels,
             share=np.full(self._levels.size, 1 / self._levels.size),
@@ -332,7 +334,7 @@ class _Mixture:
     def _score(self, pulse: Pulse, log_background: float, prior: FluxPrior) -> float:
         """Log likelihood of pulse and background, maximised over the shares of the levels."""
         pixels = np.arange(min(_TRIAL_SAMPLE, self._sample.shape[1]))
-        log = self._level_likelihoods(pulse, log_background, prior, pixels, _TRIAL_STEPS)
+        log = self._level_likelihoods(pulse, log_background, prior, pixels, _TRIAL * self._steps)
         top = log.max(axis=1, keepdims=True)
         likelihood, share = np.exp(log - top), prior.share.copy()
         learn_shares(likelihood, share)
@@ -344,7 +346,7 @@ class _Mixture:
         pixels = np.arange(self._sample.shape[1])
         self._logs = np.stack(
             [
-                self._level_likelihoods(self.pulse, each, self._known, pixels, _STEPS)
+                self._level_likelihoods(self.pulse, each, self._known, pixels, self._steps)
                 for each in self._nodes
             ]
         )
@@ -426,8 +428,9 @@ _NODES = 4
 _PIXELS_AT_ONCE = 128
 _LEAST_SHARE = 1e-6  # of pixels with an echo
 _LEAST_LIKELIHOOD = np.float32(1e-36)  # relative to the likeliest level
-_STEPS, _TRIAL_STEPS = 6.0, 3.0  # delays per width of an echo, which is its middle 80 %
-_MOST_STEPS = 8  # delays per bin
+_STEPS = 6.0, 1.2  # delays per width of an echo, its middle 80 %; and per root of its photons
+_TRIAL = 0.5  # as many to choose a pulse
+_MOST_STEPS = 16  # delays per bin
 _SHAPES = (0.3, 3000.0)  # of gamma distributions, from mostly faint pixels to equal ones
 _TRIED, _ZOOMS, _ZOOMS_NEAR = 5, 7, 3  # zooms, and those saved near the maximum
 

@@ -565,6 +565,16 @@ def test_mean_flux_intervals_cover_the_truth(
             assert each.value - 2 * below < true < each.value + 2 * above
 
 
+def test_bright_echoes_have_the_length_of_their_pulse() -> None:
+    """Between delays that are tried, they would seem shorter, and fainter."""
+    for seed in range(2):
+        scene = scenes["staircase"](16)
+        capture = simulate(scene, Acquisition(), Flux(signal=0.3, sbr=1.0), seed=seed)
+        found = inspection.estimate_mean_flux(capture).signal
+        assert found.low < 0.3 < found.high
+        assert "fit" not in inspection.capture_report(capture).flux_remark
+
+
 def test_flux_depends_neither_on_the_pulse_nor_on_the_bins() -> None:
     """Here the pulse has a tail; ``make calibration`` covers other pulses."""
     captures, truth = FLUX_REGIMES[3].captures(seed=3)
