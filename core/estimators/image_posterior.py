@@ -21,7 +21,8 @@ planes are found as if nearly every pixel had a surface; with the shares of the 
 messages pass along the same planes.
 
 If pairs of neighbours agree no more than pairs at random, each pixel is estimated by itself, by the
-likelihood with the depths of the image as their prior.
+likelihood with the depths of the image as their prior. If empty pixels are allowed, the probability
+of a surface is then that of the pixel by itself, too.
 
 Bins much shorter than an echo are merged first. Confidence is the mass of this posterior.
 """
@@ -52,7 +53,12 @@ from core.estimators.likelihood import Depths, LikelihoodParameters, curve
 from core.estimators.likelihood import locate as locate_alone
 from core.inference.flux_model import Agreement, FluxModel
 from core.inference.neighbours import box_sum
-from core.inference.posterior import States, mass_near, tolerance_probability
+from core.inference.posterior import (
+    States,
+    mass_near,
+    surface_probability,
+    tolerance_probability,
+)
 from core.kernels.blocks import LANES
 from core.kernels.messages import fill_modes, fill_posterior
 from core.kernels.parallel import on_threads
@@ -256,21 +262,30 @@ def planes(delay: Floats, weight: Floats) -> NDArray[np.float32]:
 def _locate(
     capture: Capture, flux: FluxModel, parameters: ImageParameters
 ) -> tuple[Floats, Floats]:
-    """Return the likeliest delay and the log odds of a surface."""
+    """Return the likeliest delay and the log odds of a surface.
+
+    Where neighbours do not agree, the score is the log likelihood ratio of the pixel by itself.
+    """
+    allows_empty = parameters.pixels == "allow empty pixels"
     if not _neighbours_agree(flux):
         depths: Depths = "learned" if capture.counts.size >= FEWEST_PIXELS else "alike"
         delay, score = locate_alone(capture, flux, LikelihoodParameters(depths=depths))
-        seen = capture.counts > 0
-        return np.where(seen, delay, np.nan), np.where(seen, score, 0.0)
+        kept = seen = capture.counts > 0
+        if allows_empty:
+            kept = seen & _is_surface(surface_probability(capture), parameters.false_surface)
+        return np.where(kept, delay, np.nan), np.where(seen, score, 0.0)
     found = image_posterior_of(capture, flux)
     surface = np.clip(found.surface, _LEAST_ODDS, 1 - _LEAST_ODDS)
-    if parameters.pixels == "allow empty pixels":
-        delay = np.where(
-            surface >= least_probability(surface, parameters.false_surface), found.delay, np.nan
-        )
+    if allows_empty:
+        delay = np.where(_is_surface(surface, parameters.false_surface), found.delay, np.nan)
     else:
         delay = likeliest_delays(capture, flux)
     return delay, np.log(surface / (1 - surface))
+
+
+def _is_surface(surface: Floats, false_surface: float) -> NDArray[np.bool_]:
+    """Return which pixels get a range if empty ones are allowed, by `least_probability`."""
+    return np.asarray(surface >= least_probability(surface, false_surface))
 
 
 def least_probability(surface: Floats, false_surface: float) -> float:

@@ -58,6 +58,18 @@ def posterior_of(capture: Capture) -> Posterior:
     return Posterior(within.reshape(capture.cube.shape), surface.reshape(capture.shape))
 
 
+@cached_per_capture
+def surface_probability(capture: Capture) -> Floats:
+    """Probability of a surface anywhere in the gate, (row, col), as in `posterior_of`.
+
+    Without its table, which is as large as the counts, unless that has been computed.
+    """
+    if has_posterior(capture):
+        return posterior_of(capture).surface
+    _, surface = _masses(capture, np.zeros(capture.counts.size, np.intp), 1)
+    return surface.reshape(capture.shape)
+
+
 def _masses(
     capture: Capture, first: NDArray[np.intp], n_windows: int
 ) -> tuple[NDArray[np.float32], Floats]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
+from scipy.stats import binom, norm
 
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
@@ -29,7 +30,7 @@ from core.kernels.blocks import LANES
 from core.kernels.messages import fill_posterior
 from core.kernels.planes import NEAR_PIXELS, OWN_SPREAD_BINS, fill_planes
 from core.metrics import calibration_error, reliability, restoration_degree
-from core.scene import scenes
+from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.trials import Condition
 from core.tests.twins import best_planes, log_likelihood, posterior_of_chain
@@ -172,6 +173,29 @@ def test_unrelated_pixels_are_estimated_independently() -> None:
     np.testing.assert_array_equal(found.bin, alone.bin)
     np.testing.assert_array_equal(found.confidence, alone.confidence)
     assert "each pixel is estimated by itself" in found.made_by.remark
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("surfaces", [0.0, 0.5])
+def test_few_empty_pixels_get_a_range_where_neighbours_do_not_agree(surfaces: float) -> None:
+    rng, setting, allowed = np.random.default_rng(3), Acquisition(n_bins=100), 0.01
+    delay = rng.uniform(10, 85, (48, 48))
+    delay[rng.uniform(size=delay.shape) >= surfaces] = np.nan
+    scene, flux = Scene(setting.bin_to_range_m(delay)), Flux(signal=0.1, sbr=0.1)
+    capture = simulate(scene, setting, flux, seed=4)
+    assert image_model_of(capture).agreement.alike == 0
+    every, some = (
+        estimate(capture, "image_posterior", pixels=pixels, false_surface=allowed)
+        for pixels in ("estimate every pixel", "allow empty pixels")
+    )
+    is_empty = np.isnan(delay)
+    n_empty = np.count_nonzero(is_empty)
+    most = binom.ppf(norm.cdf(4), n_empty, allowed)
+    assert np.count_nonzero(some.valid & is_empty) <= most
+    assert every.valid.all()
+    np.testing.assert_array_equal(some.bin[some.valid], every.bin[some.valid])
+    np.testing.assert_array_equal(some.score, every.score)
+    assert np.count_nonzero(some.valid & ~is_empty) >= 0.95 * np.count_nonzero(~is_empty)
 
 
 @pytest.mark.compiled
