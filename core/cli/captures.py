@@ -377,7 +377,7 @@ def _range_at_once(
         settings = tuning.settings
     found = run(capture, chosen.method, settings, chosen.false_alarm, chosen.judged_by)
     facts: dict[str, Any] = found.figures | {
-        "remark": ESTIMATORS[chosen.method].remark(capture, chosen.false_alarm),
+        "remark": ESTIMATORS[chosen.method].remark(capture, chosen.false_alarm, settings),
         "flux_s": found.flux_time_s,
         "estimate_s": found.estimate_s,
     }

@@ -95,9 +95,10 @@ def add_false_alarm(command: Any) -> None:
         "--false-alarm",
         type=float,
         help="accepted share of echo-free pixels with an estimate, "
-        f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one; without "
-        "effect on the methods unmixing and image_posterior, which have --false-acceptance and "
-        "--pixels instead",
+        f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one; the "
+        "methods kde and chi exceed it next to surfaces, since they add neighbouring pixels; "
+        "without effect on the methods unmixing and image_posterior, which have "
+        "--false-acceptance and --pixels instead",
     )
 
 

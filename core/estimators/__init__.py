@@ -85,8 +85,10 @@ def estimate(
         Settings of the method, of type ``ESTIMATORS[method].parameters``.
     false_alarm : float, optional
         Give a range only where the score exceeds the threshold that this share of echo-free pixels
-        exceeds. If None, every pixel with a detection gets one. The methods "unmixing" and
-        "image_posterior" ignore it; see their settings ``false_acceptance`` and ``pixels``.
+        exceeds. If None, every pixel with a detection gets one. The methods "kde" and "chi" add
+        neighbouring pixels, so that next to surfaces more empty pixels get a range. The methods
+        "unmixing" and "image_posterior" ignore it; see their settings ``false_acceptance`` and
+        ``pixels``.
     judged_by : {"pixel", "image"}
         What determines the confidence: the counts of the pixel alone, or those of its neighbours,
         too (`judged_by_image`).
@@ -113,7 +115,7 @@ def estimate(
     require_memory(capture, method, settings, false_alarm)
     estimator = ESTIMATORS[method]
     made_by = Provenance(
-        method, settings, false_alarm, partial(estimator.remark, capture, false_alarm)
+        method, settings, false_alarm, partial(estimator.remark, capture, false_alarm, settings)
     )
     image = replace(estimator(capture, settings, false_alarm), made_by=made_by)
     if judged_by == "image":

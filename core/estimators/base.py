@@ -263,6 +263,12 @@ class Evidence(NamedTuple):
     """From both."""
 
 
+NEXT_TO_SURFACES = (
+    "next to surfaces, a larger share of empty pixels get a range than is asked for: counts of "
+    "neighbouring pixels are added"
+)
+"""Remark of methods that add neighbours, whose threshold is that of pixels far from surfaces."""
+
 NOT_JUDGED = "the goodness of fit, which is that of surfaces at rest, is not judged"
 """Remark of methods that follow motion."""
 
@@ -379,10 +385,13 @@ class Estimator:
         """
         return self.ranged(capture, parameters, self.calibration(capture, parameters, false_alarm))
 
-    def remark(self, capture: Capture, false_alarm: float | None = None) -> str:
+    def remark(
+        self, capture: Capture, false_alarm: float | None = None, parameters: Any = None
+    ) -> str:
         """Return why confidences mislead and what is left out of the model; empty if nothing.
 
-        Also whether `false_alarm` of the call has no effect. Clauses are separated by semicolons.
+        Also whether `false_alarm` of the call has no effect, or is exceeded next to surfaces with
+        `parameters` (by default the default settings). Clauses are separated by semicolons.
         """
         follows_motion = self.follows_motion and capture.groups is not None
         fit = NOT_JUDGED if follows_motion else fit_of(capture).remark
@@ -391,8 +400,11 @@ class Estimator:
             known = capture.detection == "all"
             why = "the capture holds all photons" if known else "the number of pulses is not known"
             clauses.append(f"no pile-up is undone: {why}")
-        if self.own_threshold and false_alarm not in (None, 1):
-            clauses.append(f"the share of false alarms is not controlled: {self.own_threshold}")
+        if false_alarm not in (None, 1):
+            if self.own_threshold:
+                clauses.append(f"the share of false alarms is not controlled: {self.own_threshold}")
+            elif self.window_size(parameters or self.parameters()) > 1:
+                clauses.append(NEXT_TO_SURFACES)
         return "; ".join(filter(None, clauses))
 
     def calibration(

@@ -121,7 +121,7 @@ def learned(
     """Learn from a sample of a Dask array what all pixels share; with `Estimator.remark`."""
     sample, estimator = captured(sample_of(array), description), ESTIMATORS[method]
     calibration = estimator.calibration(sample, settings, false_alarm)
-    return flux_prior_of(sample), calibration, estimator.remark(sample)
+    return flux_prior_of(sample), calibration, estimator.remark(sample, false_alarm, settings)
 
 
 def range_part(

@@ -212,6 +212,27 @@ def test_a_method_with_its_own_threshold_says_so(half: Capture) -> None:
     assert "false alarms" not in free.made_by.remark
 
 
+@every_estimator
+def test_a_method_that_adds_neighbours_says_that_it_exceeds_the_rate(method: str) -> None:
+    rng = np.random.default_rng(4)
+    onset_bin = rng.uniform(2, N_BINS - 8, (SIZE, SIZE))
+    is_empty = rng.uniform(size=onset_bin.shape) < 0.5
+    capture = simulated(np.where(is_empty, np.nan, onset_bin), seed=5, sbr=0.1)
+    adds = ESTIMATORS[method].window_size(ESTIMATORS[method].parameters()) > 1
+    for false_alarm, expected in ((0.01, adds), (1, False), (None, False)):
+        image = estimate(capture, method, false_alarm=false_alarm)
+        assert image.made_by is not None
+        assert (base.NEXT_TO_SURFACES in image.made_by.remark) == expected
+        if false_alarm == 0.01:
+            assert (image.valid[is_empty].mean() > 0.05) == adds
+
+
+def test_density_of_single_pixels_keeps_the_rate(half: Capture) -> None:
+    image = estimate(half, "kde", false_alarm=0.1, neighbourhood="1x1")
+    assert image.made_by is not None
+    assert base.NEXT_TO_SURFACES not in image.made_by.remark
+
+
 def test_other_false_alarm_rates_are_refused(half: Capture) -> None:
     for bad in (0, 0.0, -0.1, 0.0001, 1.001, 2, math.nan, math.inf, "x", True):
         with pytest.raises(ValueError, match=r"false_alarm = .* is not accepted"):

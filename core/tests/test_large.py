@@ -72,6 +72,12 @@ def test_settings_are_those_of_estimate() -> None:
         estimate_large(COUNTS, "best")
 
 
+def test_the_remark_is_that_of_estimate() -> None:
+    whole = estimate(CAPTURE, "kde", false_alarm=0.1).made_by
+    assert whole is not None and "next to surfaces" in whole.remark
+    assert estimate_large(COUNTS, "kde", false_alarm=0.1).attrs["remark"] == whole.remark
+
+
 @pytest.mark.parametrize("method", [name for name in ESTIMATORS if ESTIMATORS[name].whole_image])
 def test_methods_that_need_the_whole_image_are_refused(method: str) -> None:
     with pytest.raises(ValueError, match=rf"method = '{method}' .*'tracking' or .*whole image"):

@@ -61,8 +61,8 @@ methods also have a sampling error, which is the interval below them.
 
 FALSE_ALARM_HELP = (
     "Share of echo-free pixels for which a method may report a range. With lower values it reports "
-    "one only where its score exceeds the level of noise. 1 reports all. Unmixing ignores it: its "
-    "own τ_FA decides."
+    "one only where its score exceeds the level of noise. 1 reports all. Methods that add "
+    "neighbouring pixels report more next to surfaces. Unmixing ignores it: its own τ_FA decides."
 )
 
 TABLE = "Methods and their figures; click a column's header to sort."
