@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from numbers import Real
 from typing import Literal
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
 from numpy.typing import ArrayLike, NDArray
 
-from core.checks import require, require_whole
+from core.checks import require, require_type, require_whole
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +36,7 @@ MOST_PULSES = 2**53
 def require_time(name: str, value_s: float, least_s: float) -> None:
     """Raise ``ValueError`` unless a time lies between `least_s` and `LONGEST_S` seconds."""
     accepted = f"a time from {least_s:g} to {LONGEST_S:g} s"
+    require_type(name, value_s, Real, f"{accepted}, as a number of seconds")
     require(name, value_s, least_s <= value_s <= LONGEST_S, accepted)
 
 
@@ -80,12 +82,10 @@ class Acquisition:
         require_time("gate_delay_s", self.gate_delay_s, -LONGEST_S)
         if self.n_pulses is not None:
             require_whole("n_pulses", self.n_pulses, MOST_PULSES, ", or None if unknown")
-        require(
-            "pixel_angle_rad",
-            self.pixel_angle_rad,
-            self.pixel_angle_rad is None or 0 < self.pixel_angle_rad < 1,
-            "between 0 and 1 radian, or None if unknown",
-        )
+        if self.pixel_angle_rad is not None:
+            angle_rad, accepted = self.pixel_angle_rad, "between 0 and 1 radian, or None if unknown"
+            require_type("pixel_angle_rad", angle_rad, Real, accepted)
+            require("pixel_angle_rad", angle_rad, 0 < angle_rad < 1, accepted)
 
     def bin_to_range_m(self, bins: ArrayLike) -> Floats:
         """Range in metres of a (fractional) bin position, any shape; NaN stays NaN."""
@@ -331,9 +331,11 @@ class Flux:
     sbr: float = 0.06
 
     def __post_init__(self) -> None:
-        finite = 0 <= self.signal < np.inf
-        require("signal", self.signal, finite, "finite and non-negative photons per pulse")
-        require("sbr", self.sbr, self.sbr > 0, "positive")
+        accepted = "a finite and non-negative number of photons per pulse"
+        require_type("signal", self.signal, Real, accepted)
+        require("signal", self.signal, 0 <= self.signal < np.inf, accepted)
+        require_type("sbr", self.sbr, Real, "a positive number")
+        require("sbr", self.sbr, self.sbr > 0, "a positive number")
         background = self.signal / self.sbr
         require("background, signal / sbr", background, background < np.inf, "a finite number")
 

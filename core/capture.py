@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, update_wrapper
+from numbers import Real
 from typing import (
     TYPE_CHECKING,
     Any,
@@ -17,6 +18,7 @@ from typing import (
     Protocol,
     TypeVar,
     get_args,
+    runtime_checkable,
 )
 from weakref import WeakKeyDictionary
 
@@ -24,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.checks import require
+from core.checks import require, require_type
 from core.deprecation import renamed
 from core.kernels.blocks import Blocks, pixel_sums, to_blocks
 from core.labels import dataset
@@ -96,7 +98,8 @@ class Capture:
     pulse : Pulse
         Shape of an echo.
     truth_range_m : ndarray, shape (row, col), optional
-        True range in metres, NaN where there is no target; None for a capture without truth.
+        True range in metres, NaN where there is no target; None for a capture without truth. This
+        and the other images may be given as lists of rows, too.
     signal : ndarray, shape (row, col), optional
         True signal photons per pulse, if known.
     background : float, optional
@@ -148,13 +151,16 @@ class Capture:
     groups: PulseGroups | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        cube = self.cube
+        cube, counts = self.cube, "uint8, uint16 or uint32 counts of shape (row, col, bin)"
+        require_type("cube", cube, np.ndarray, f"a NumPy array of {counts}")
         require(
             "cube",
             f"{cube.dtype} array of shape {cube.shape}",
             cube.ndim == 3 and cube.dtype in COUNT_TYPES and min(cube.shape) > 0,
-            "uint8, uint16 or uint32 counts of shape (row, col, bin), none of them 0",
+            f"{counts}, none of them 0",
         )
+        require_type("acquisition", self.acquisition, Acquisition, "a core.Acquisition")
+        require_type("pulse", self.pulse, Pulse, "a core.Pulse, such as core.Pulse(1e-9)")
         require(
             "n_bins",
             self.acquisition.n_bins,
@@ -162,16 +168,18 @@ class Capture:
             f"{cube.shape[2]}, the cube's last axis",
         )
         for name in IMAGES:
-            image = getattr(self, name)
-            if image is not None:
+            if getattr(self, name) is not None:
+                image = _image(name, getattr(self, name))
                 fits = image.shape == self.shape
                 require(name, f"shape {image.shape}", fits, f"shape {self.shape}, that of the cube")
+                object.__setattr__(self, name, image)  # a list has become an array
         if self.signal is not None:
             low, high = float(np.min(self.signal)), float(np.max(self.signal))
             require("signal", (low, high), 0 <= low <= high < np.inf, "finite and non-negative")
         if self.background is not None:
-            finite = 0 <= self.background < np.inf
-            require("background", self.background, finite, "finite and non-negative")
+            accepted = "a finite and non-negative number"
+            require_type("background", self.background, Real, accepted)
+            require("background", self.background, 0 <= self.background < np.inf, accepted)
         kinds = get_args(Detection)
         require("detection", self.detection, self.detection in kinds, " or ".join(map(repr, kinds)))
         cube.setflags(write=False)
@@ -255,6 +263,19 @@ class Capture:
         return html_table("Capture", self.facts)
 
 
+def _image(name: str, values: Any) -> NDArray[Any]:
+    """Return an image as an array; raise ``ValueError`` unless it holds real numbers."""
+    try:
+        image: NDArray[Any] = np.asanyarray(values)
+    except ValueError:  # rows of different lengths
+        image = np.asarray(values, object)
+    is_real = np.issubdtype(image.dtype, np.integer) or np.issubdtype(image.dtype, np.floating)
+    given = f"array of {image.dtype} of shape {image.shape}"
+    require(name, given, is_real, "real numbers of shape (row, col), NaN where there is none")
+    return image
+
+
+@runtime_checkable
 class CaptureInfo(Protocol):
     """The part of a `Capture` that is available even if its cube is not in memory."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import reprlib
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Integral
@@ -13,6 +15,7 @@ __all__ = [
     "require",
 ]
 
+_MOST_OF_VALUE = 80  # characters
 _MOST_SHOWN = 200  # characters of a file's path
 
 
@@ -34,6 +37,28 @@ def require(name: str, value: object, accepted: bool, what: str) -> None:
     """
     if not accepted:
         raise ValueError(f"{name} = {value!r} is not accepted: give {what}.")
+
+
+def require_type(
+    name: str, value: object, kind: type[Any] | tuple[type[Any], ...], what: str
+) -> None:
+    """Raise ``ValueError`` unless a value is of a type.
+
+    Call it before comparing a value, which raises an error without a name for a value of another
+    type.
+
+    Parameters
+    ----------
+    name, what
+        As for `require`.
+    value : object
+        Shown shortened.
+    kind : type or tuple of type
+        Such as ``numbers.Real`` for a number.
+    """
+    if not isinstance(value, kind):
+        short = textwrap.shorten(reprlib.repr(value), _MOST_OF_VALUE, placeholder=" ...")
+        raise ValueError(f"{name} = {short} is not accepted: give {what}.")
 
 
 def require_whole(name: str, value: Any, most: int, also: str = "") -> None:

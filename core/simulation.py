@@ -23,7 +23,7 @@ import numpy as np
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse, pulses_sent
 from core.capture import Capture
-from core.checks import require
+from core.checks import require, require_type
 from core.kernels.parallel import on_threads
 from core.kernels.simulate import SHAPE_CODES, add_echo_photons, fire_once
 from core.pulse_groups import PulseGroups, group_sizes
@@ -73,9 +73,13 @@ def simulate(
     Raises
     ------
     ValueError
-        If the number of pulses is unknown or 2**32 or more, or the seed is not an integer from 0 to
-        2**63 - 1.
+        If an argument is of another type, the number of pulses is unknown or 2**32 or more, or the
+        seed is not an integer from 0 to 2**63 - 1.
     """
+    require_type("scene", scene, Scene, "a core.Scene, such as core.scenes['car'](64)")
+    require_type("acquisition", acquisition, Acquisition, "a core.Acquisition")
+    require_type("flux", flux, Flux, "a core.Flux, such as core.Flux(sbr=0.1)")
+    require_type("pulse", pulse, Pulse, "a core.Pulse, such as core.Pulse(1e-9)")
     n_pulses = pulses_sent(acquisition)
     require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
     _require_seed(seed)

@@ -179,6 +179,17 @@ REFUSED = [
     ),
     *((Flux, {"signal": value}, f"signal = {value} ") for value in (-0.1, np.inf, np.nan)),
     *((Flux, {"sbr": value}, f"sbr = {value} ") for value in (0.0, np.nan)),
+    # Of another type
+    (Acquisition, {"bin_width_s": "1ns"}, r"bin_width_s = '1ns' .*1e-18 to 10 s, as a number of s"),
+    (Acquisition, {"gate_delay_s": None}, r"gate_delay_s = None .*-10 to 10 s, as a number of sec"),
+    (Acquisition, {"pixel_angle_rad": "1mrad"}, r"pixel_angle_rad = '1mrad' .*1 radian"),
+    (Pulse, {"tau_s": "1ns"}, r"tau_s = '1ns' .*as a number of seconds"),
+    (Flux, {"signal": "a", "sbr": 1}, r"signal = 'a' .*number of photons per pulse"),
+    (
+        Flux,
+        {"sbr": [0.1] * 10**6},
+        r"sbr = \[0.1, .*\.\.\.\] is not accepted: give a positive number",
+    ),
 ]
 
 

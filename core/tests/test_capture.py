@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from core.acquisition import Acquisition, Pulse
-from core.capture import MOST_CACHED, Capture, cached_per_capture
+from core.capture import IMAGES, MOST_CACHED, Capture, cached_per_capture
 from core.inference.flux import flux_prior_of
 
 
@@ -145,3 +145,52 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 def test_inconsistent_captures_are_refused(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Capture(**{"cube": COUNTS, "acquisition": Acquisition(n_bins=4)} | changed)
+
+
+CUBE, TEN_BINS = np.zeros((2, 3, 10), np.uint16), Acquisition(n_bins=10)
+
+WRONG_TYPES: dict[str, tuple[Any, str]] = {
+    "list of counts": (
+        lambda: Capture(CUBE.tolist(), TEN_BINS),
+        r"cube = \[\[\[0, .* a NumPy array of uint8, uint16 or uint32",
+    ),
+    "no acquisition": (
+        lambda: Capture(CUBE, acquisition=None),  # type: ignore[arg-type]
+        "acquisition = None .* a core.Acquisition",
+    ),
+    "width as pulse": (
+        lambda: Capture(CUBE, TEN_BINS, 1e-9),  # type: ignore[arg-type]
+        "pulse = 1e-09 .* a core.Pulse",
+    ),
+    "texts as truth": (
+        lambda: Capture(CUBE, TEN_BINS, truth_range_m=np.full((2, 3), "1 m")),
+        "truth_range_m = .*<U3.* real numbers",
+    ),
+    "complex truth": (
+        lambda: Capture(CUBE, TEN_BINS, truth_range_m=np.full((2, 3), 1j)),
+        "truth_range_m = .*complex128.* real numbers",
+    ),
+    "rows of different lengths": (
+        lambda: Capture(CUBE, TEN_BINS, truth_range_m=[[1.0], [1.0, 2.0]]),  # type: ignore[arg-type]
+        "truth_range_m = .*object.* real numbers",
+    ),
+    "text as background": (
+        lambda: Capture(CUBE, TEN_BINS, background="1"),  # type: ignore[arg-type]
+        "background = '1' .* number",
+    ),
+}
+
+
+@pytest.mark.parametrize("make, message", WRONG_TYPES.values(), ids=WRONG_TYPES)
+def test_values_of_another_type_are_refused_by_name(make: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_images_may_be_lists(name: str) -> None:
+    capture = Capture(CUBE, TEN_BINS, **{name: [[1, 2, 3], [4.5, 5, 6]]})
+    np.testing.assert_array_equal(getattr(capture, name), [[1, 2, 3], [4.5, 5, 6]])
+    assert isinstance(getattr(capture, name), np.ndarray)
+    given = np.ones((2, 3), np.float32)
+    assert getattr(Capture(CUBE, TEN_BINS, **{name: given}), name) is given

@@ -918,3 +918,16 @@ def test_a_pixel_that_cannot_be_saved_is_refused(
     with pytest.raises(ValueError, match=message):
         save_pixel(CAPTURE, row, col, None, tmp_path / name)
     assert os.listdir(tmp_path) == []
+
+
+def test_arguments_in_another_order_are_refused(tmp_path: Path) -> None:
+    path, image = tmp_path / "swapped.npz", core.estimate(CAPTURE, "peak")
+    calls: list[tuple[Any, str]] = [
+        (lambda: core.save_image(image, CAPTURE, path), r"image = Capture\(.* a core.RangeImage"),  # type: ignore[arg-type]
+        (lambda: core.save_image(image, image, path), r"capture = RangeImage\(.* a core.Capture"),  # type: ignore[arg-type]
+        (lambda: core.save_capture(image, path), r"capture = .*RangeImage.* a core.Capture"),  # type: ignore[arg-type]
+    ]
+    for save, message in calls:
+        with pytest.raises(ValueError, match=message):
+            save()
+    assert not path.exists()

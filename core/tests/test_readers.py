@@ -118,7 +118,10 @@ def test_contract_arguments_that_do_not_fit(kept: Format, tmp_path: Path) -> Non
         {"gate_delay_s": np.nan},
         {"n_bins": 1.5},
         {"n_pulses": -1},
+        {"bin_width_s": "64ps"},
         {"pixel_angle_rad": 2.0},
+        {"pixel_angle_rad": "1mrad"},
+        {"pulse_rate_hz": "20 kHz"},
         {"time_unit_s": -1.0},
         {"stop_s": np.inf},
         {"detection": "some"},
@@ -135,6 +138,7 @@ def test_contract_arguments_that_do_not_fit(kept: Format, tmp_path: Path) -> Non
         with pytest.raises(CaptureError, match=rf"^{kept.name}: .*{field}") as caught:
             read_capture(path, **{**kept.needs, **arguments})
         assert str(value) in str(caught.value)
+        assert "cannot be read" not in str(caught.value)  # the file is not to blame
 
 
 @every_format

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -288,3 +289,16 @@ def test_first_photons_are_not_reduced_again() -> None:
         first_photons(photons, 0)
     with pytest.raises(ValueError, match="seed = -1"):
         first_photons(photons, 50, seed=-1)
+
+
+@pytest.mark.parametrize("name", ["scene", "acquisition", "flux", "pulse"])
+def test_arguments_of_another_type_are_refused_by_name(name: str) -> None:
+    given: dict[str, Any] = {
+        "scene": Scene(np.full((2, 3), 50.0)),
+        "acquisition": Acquisition(),
+        "flux": Flux(),
+        "pulse": Pulse(),
+    }
+    for wrong in (None, 1e-9):
+        with pytest.raises(ValueError, match=rf"{name} = {wrong} .* a core\.{name.title()}"):
+            simulate(**{**given, name: wrong})

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, get_args
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from core.acquisition import LONGEST_S, MOST_BINS, MOST_PULSES, SHORTEST_BIN_S, Pulse, require_time
 from core.capture import Detection
-from core.checks import require, require_whole
+from core.checks import require, require_type, require_whole
 from core.io.readers.quantities import (
     EXAMPLE,
     EXAMPLE_OF_ANGLE,
@@ -90,6 +91,14 @@ def _required(accepts: str, is_valid: Callable[[Any], bool]) -> Check:
     return lambda name, value: require(name, value, is_valid(value), accepts)
 
 
+def _required_number(accepts: str, is_valid: Callable[[Any], bool]) -> Check:
+    def check(name: str, value: Any) -> None:
+        require_type(name, value, Real, accepts)
+        require(name, value, is_valid(value), accepts)
+
+    return check
+
+
 def _parsed_shape(text: str) -> tuple[int, int]:
     rows, cols = re.split(r"[\s,x×]+", text.strip())
     return int(rows), int(cols)
@@ -120,7 +129,7 @@ _ANGLE = Kind(
     "float",
     parsed_angle,
     EXAMPLE_OF_ANGLE,
-    _required("an angle between 0 and 1 radian", lambda value: 0 < value < 1),
+    _required_number("an angle between 0 and 1 radian", lambda value: 0 < value < 1),
     angle_as_typed,
 )
 _WHOLE = Kind("int", int, "a whole number", _required("a whole number", _is_whole))
@@ -150,7 +159,7 @@ _RATE = Kind(
     "float",
     float,
     "pulses per second such as 20e3",
-    _required("pulses per second, positive", lambda value: 0 < value < np.inf),
+    _required_number("pulses per second, positive", lambda value: 0 < value < np.inf),
     lambda rate_hz: repr(float(rate_hz)),
 )
 _PULSE = Kind(

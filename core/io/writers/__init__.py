@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Capture, CaptureInfo
-from core.checks import require
-from core.estimators import RangeImage, settings_of
+from core.checks import require, require_type
+from core.estimators import RangeImage, require_capture, settings_of
 from core.inference import RangeInterval
 from core.io.readers.npz import fields
 from core.io.writers import las, netcdf, npz, pcd, picture, ply, table, tiff
@@ -111,6 +111,7 @@ def save_capture(
     OSError
         If the folder cannot be written; an older file is then left as it was.
     """
+    require_capture(capture)
     path, suffix = _path_and_suffix(path, CAPTURE_SUFFIXES)
     if suffix != ".npz" and capture.groups is not None:
         n_groups = f"{len(capture.groups.counts)} groups of pulses"
@@ -196,13 +197,17 @@ def save_image(
     Raises
     ------
     ValueError
-        If the suffix is unknown, image and capture, colours, interval or p-values differ in shape,
-        the angle is not between 0 and π/2, or a cloud needs an angle that is unknown.
+        If an argument is of another type, the suffix is unknown, image and capture, colours,
+        interval or p-values differ in shape, the angle is not between 0 and π/2, or a cloud needs
+        an angle that is unknown.
     FileExistsError
         If the file exists and is not to be replaced.
     OSError
         If the folder cannot be written; an older file is then left as it was.
     """
+    order = "in the order save_image(capture, image, path)"
+    require_type("image", image, RangeImage, f"a core.RangeImage, {order}")
+    require_type("capture", capture, CaptureInfo, f"a core.Capture, {order}")
     path, suffix = _path_and_suffix(path, (*WRITERS, *FOLDER_WRITERS))
     if pixel_angle_rad is None:
         pixel_angle_rad = capture.acquisition.pixel_angle_rad
