@@ -77,6 +77,14 @@ def require_whole(name: str, value: Any, most: int, also: str = "") -> None:
     require(name, value, accepted, f"a whole number from 1 to {most:,}{also}")
 
 
+def require_pixel(row: Any, col: Any, shape: tuple[int, int]) -> None:
+    """Raise ``ValueError`` unless a pixel lies within an image of a shape (row, col)."""
+    (rows, cols), is_whole = shape, isinstance(row, Integral) and isinstance(col, Integral)
+    inside = is_whole and 0 <= row < rows and 0 <= col < cols
+    accepted = f"a pixel of {rows} rows and {cols} columns, by whole numbers from 0"
+    require("row, col", (row, col), inside, accepted)
+
+
 def printable(text: str) -> str:
     """Replace the bytes of a file name that are not valid text, so that it can be encoded."""
     try:

@@ -3,7 +3,8 @@
 Metrics consider target pixels, those with a finite true range. A target pixel without an estimate
 counts as not restored; errors and their means are over estimated pixels, so quote `coverage` with
 them. Ranges and truth are array_like of the same shape (row, col), in metres; NaN means no estimate
-or no target. All functions raise ``ValueError`` if the shapes differ.
+or no target. All functions raise ``ValueError`` if the shapes differ, a range is infinite, or a
+tolerance is negative or NaN.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ def errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
     """Errors in metres of all target pixels, flat; NaN where a target has no estimate."""
     found, truth = np.asarray(range_m, float), np.asarray(truth_m, float)
     require("range_m", f"shape {found.shape}", found.shape == truth.shape, f"{truth.shape}")
+    _require_not_infinite(found)
     target = np.isfinite(truth)
     return np.asarray(found[target] - truth[target])
 
@@ -190,6 +192,7 @@ def estimator_variance_m2(range_m: ArrayLike, truth_m: ArrayLike) -> float:
     found, truth = np.asarray(range_m, float), np.asarray(truth_m, float)
     fits = found.ndim == truth.ndim + 1 and found.shape[1:] == truth.shape
     require("range_m", f"shape {found.shape}", fits, f"(repetition, *{truth.shape})")
+    _require_not_infinite(found)
     found = found[:, np.isfinite(truth)]
     found = found[:, np.isfinite(found).sum(axis=0) >= 2]
     return _mean(np.nanvar(found, axis=0, ddof=1))
@@ -280,6 +283,7 @@ def _targets(range_m: ArrayLike, truth_m: ArrayLike) -> tuple[Floats, Floats]:
     found, truth = (np.sort(np.asarray(each, float), axis=0) for each in (range_m, truth_m))
     of = found.shape[1:]
     require("range_m", f"shape (n, {of})", of == truth.shape[1:], f"(n, {truth.shape[1:]})")
+    _require_not_infinite(found)
     target = np.isfinite(truth[0])
     return found[:, target], truth[:, target]
 
@@ -289,7 +293,14 @@ def _found_errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
     return error[np.isfinite(error)]
 
 
+def _require_not_infinite(range_m: Floats) -> None:
+    n_infinite = int(np.count_nonzero(np.isinf(range_m)))
+    accepted = "finite ranges, and NaN where there is no estimate"
+    require("range_m", f"{n_infinite:,} infinite ranges", n_infinite == 0, accepted)
+
+
 def _within(error_m: Floats, tolerance_m: float) -> NDArray[np.bool_]:
+    require("tolerance_m", tolerance_m, tolerance_m >= 0, "a non-negative number of metres")
     # Half a micrometre of slack, so that an error of whole bins meets a tolerance of whole bins.
     return np.asarray(np.abs(error_m) <= tolerance_m + 5e-7)
 
@@ -336,7 +347,15 @@ def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Reliabilit
         From 0 to 1.
     right : ndarray of bool, shape (estimate,)
         Whether the estimate lies within 3 bins of a surface.
+
+    Raises
+    ------
+    ValueError
+        If a confidence is not a probability, or the shapes differ.
     """
+    require("right", f"shape {right.shape}", right.shape == confidence.shape, f"{confidence.shape}")
+    for extreme in (confidence.min(initial=1.0), confidence.max(initial=0.0)):
+        require("confidence", float(extreme), 0 <= extreme <= 1, "probabilities, 0 to 1")
     tenth = np.minimum((confidence * 10).astype(int), 9)
     found = []
     for members in (tenth == k for k in np.unique(tenth)):
@@ -347,6 +366,11 @@ def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Reliabilit
 
 
 def calibration_error(bins: Sequence[ReliabilityBin]) -> float:
-    """Expected calibration error: mean distance between confidence and share of right estimates."""
+    """Expected calibration error: mean distance between confidence and share of right estimates.
+
+    NaN without estimates.
+    """
     count = sum(each.count for each in bins)
+    if not count:
+        return math.nan
     return sum(each.count * abs(each.confidence - each.right.value) for each in bins) / count

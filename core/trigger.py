@@ -175,9 +175,11 @@ def coates_rate(counts: ArrayLike, n_pulses: int) -> Floats:
     Raises
     ------
     ValueError
-        If a pixel fired more often than pulses were sent.
+        If a count is negative, or a pixel fired more often than pulses were sent.
     """
     counts = np.asarray(counts).astype(np.int64)
+    least = int(counts.min(initial=0))
+    require("counts", least, least >= 0, "non-negative numbers")
     total = int(counts.sum(axis=-1).max(initial=0))
     require("n_pulses", n_pulses, n_pulses >= total, f"at least {total}, the detections of a pixel")
     armed = n_pulses - (np.cumsum(counts, axis=-1) - counts)

@@ -54,6 +54,7 @@ from core.estimators import (
     suitable_method,
     with_returns,
 )
+from core.inference import FALSE_RETURN
 from core.inspection import (
     CaptureReport,
     PixelReport,
@@ -322,6 +323,9 @@ def _estimate(chosen: argparse.Namespace) -> None:
     if chosen.tuned and (in_tiles or settings != type(settings)()):
         why = "a capture larger than memory" if in_tiles else "other settings"
         raise ValueError(f"--tuned cannot be combined with {why}.")
+    if chosen.false_return is not None and chosen.returns == 1:
+        given = f"--false-return {chosen.false_return:g}"
+        raise ValueError(f"{given} has no effect on one return: give --returns 2 or more, too.")
     if in_tiles:
         refuse_further_values(chosen.intervals, chosen.fit)
         one = chosen.returns == 1
@@ -385,7 +389,8 @@ def _range_at_once(
         facts |= _targets(capture.truth_range_m)
     image = found.image
     if chosen.returns > 1:
-        image = with_returns(capture, image, chosen.returns, chosen.false_return)
+        share = FALSE_RETURN if chosen.false_return is None else chosen.false_return
+        image = with_returns(capture, image, chosen.returns, share)
         assert image.returns is not None
         several = image.returns.count(capture.shape) > 1
         facts["pixels_with_several_returns"] = int(several.sum())

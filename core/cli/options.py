@@ -114,8 +114,8 @@ def add_returns(command: Any) -> None:
     command.add_argument(
         "--false-return",
         type=float,
-        default=FALSE_RETURN,
-        help=f"accepted share of pixels with one surface that get a second ({FALSE_RETURN:g})",
+        help="with --returns: accepted share of pixels with one surface that get a second "
+        f"({FALSE_RETURN:g})",
     )
 
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats, Pulse
 from core.capture import Capture, cached_per_capture
-from core.checks import require
+from core.checks import require, require_pixel
 from core.inference.flux import LEVEL_SPAN, LEVELS, flux_model_of
 from core.inference.posterior import TOLERANCE_BINS
 from core.metrics import Interval
@@ -114,7 +114,13 @@ def pixel_range_intervals(
     -------
     tuple of Interval
         The estimate and its limits in metres; NaN without an estimate.
+
+    Raises
+    ------
+    ValueError
+        If there is no such pixel, or a level is not between 0 and 1.
     """
+    require_pixel(row, col, capture.shape)
     estimate_m = float(image.range_m[row, col])
     tails = _all_tails(levels)
     limits_m = np.full(tails.size, np.nan)

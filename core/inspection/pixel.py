@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
-from core.checks import require
+from core.checks import require_pixel
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.estimators.base import Evidence
@@ -183,9 +183,7 @@ def pixel_report(
     ValueError
         If there is no such pixel, or the method or its settings are unknown.
     """
-    rows, cols = capture.shape
-    inside = 0 <= row < rows and 0 <= col < cols
-    require("row, col", (row, col), inside, f"a pixel of {rows} rows and {cols} columns")
+    require_pixel(row, col, capture.shape)
     settings = settings_of(method, settings)
     counts = capture.cube[row, col].astype(float)
     curve = ESTIMATORS[method].curves(capture, row, col, settings)

@@ -490,3 +490,13 @@ def test_a_second_capture_is_refused(capsys: pytest.CaptureFixture[str]) -> None
     with pytest.raises(SystemExit, match="2"):
         main(["estimate", "peak", "--capture", "a.npz", "--capture", "b.npz"])
     assert "--capture is given twice, a.npz and b.npz" in capsys.readouterr().err
+
+
+def test_a_share_of_false_returns_needs_several_returns(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ("estimate", "peak", "--capture", frames, *READING, "--false-return", "0.05")
+    code, _, err = ran(capsys, *command)
+    assert code == 2
+    assert "--false-return 0.05 has no effect on one return: give --returns 2 or more" in err
+    assert "pixels_with_several_returns" in facts(capsys, *command, "--returns", "2")

@@ -906,9 +906,9 @@ def test_default_settings_of_a_pixel_are_the_recommended(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("row", "col", "name", "message"),
     [
-        (-1, 0, "pixel.csv", "row = -1 .* from 0 to 6"),
-        (0, 9, "pixel.csv", "col = 9 .* from 0 to 8"),
-        (0, 1.5, "pixel.csv", "col = 1.5 .* an integer"),
+        (-1, 0, "pixel.csv", r"row, col = \(-1, 0\) .* 7 rows and 9 columns"),
+        (0, 9, "pixel.csv", r"row, col = \(0, 9\) .* 7 rows and 9 columns"),
+        (0, 1.5, "pixel.csv", r"row, col = \(0, 1.5\) .* whole numbers"),
         (0, 0, "pixel.npz", r"suffix = '\.npz' .*one of \.csv"),
     ],
 )

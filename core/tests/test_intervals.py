@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -183,6 +184,14 @@ def test_a_level_that_is_no_probability_is_refused() -> None:
     other = replace(capture, cube=capture.cube[:5], truth_range_m=None, flux_prior=None)
     with pytest.raises(ValueError, match="image = "):
         core.range_interval(other, image)
+
+
+@pytest.mark.parametrize(("row", "col"), [(-1, 0), (0, -1), (10**6, 0), (0, 10**6), (0, 0.5)])
+def test_a_pixel_outside_the_image_has_no_interval(row: Any, col: Any) -> None:
+    capture = drawn(Pulse(), 300)
+    image = estimate(capture, "peak")
+    with pytest.raises(ValueError, match=rf"row, col = \({row}, {col}\) .* rows and .* columns"):
+        core.pixel_range_intervals(capture, image, row, col)
 
 
 @pytest.mark.parametrize("n_pulses", [None, 1, 1000])

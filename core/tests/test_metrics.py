@@ -132,6 +132,11 @@ def test_reliability_compares_like_with_like() -> None:
     assert metrics.calibration_error([low, high]) == pytest.approx(expected)
 
 
+def test_no_estimates_have_no_calibration_error() -> None:
+    assert metrics.reliability(np.empty(0), np.empty(0, bool)) == []
+    assert math.isnan(metrics.calibration_error([]))
+
+
 def test_surfaces_are_matched_one_to_one() -> None:
     nan = np.nan
     truth_m = np.array([[10.0, 10.0, 10.0, nan, 10.0], [12.0, 12.0, nan, nan, 10.5]])
@@ -165,6 +170,35 @@ REFUSED = [
         (metrics.rd_variance, (rd,), "rd_per_repetition = .*2 or more")
         for rd in ([], [0.9], 0.9, [[0.9, 0.8]])
     ),
+    *(
+        (
+            figure,
+            (np.where(RANGE_M == 52, sign * np.inf, RANGE_M), TRUTH_M),
+            "range_m = '1 infinite",
+        )
+        for figure in (*ERRORS, metrics.coverage)
+        for sign in (-1, 1)
+    ),
+    (metrics.estimator_variance_m2, (np.full((2, 2, 3), np.inf), TRUTH_M), "12 infinite ranges"),
+    *(
+        (figure, (RANGE_M, TRUTH_M, tolerance_m), f"tolerance_m = {tolerance_m} .*non-negative")
+        for figure in (metrics.restoration_degree, metrics.restored, metrics.inlier_rmse_m)
+        for tolerance_m in (-1.0, math.nan)
+    ),
+    (
+        metrics.surfaces_found,
+        (RANGE_M[np.newaxis], TRUTH_M[np.newaxis], -1.0),
+        "tolerance_m = -1.0 .*non-negative",
+    ),
+    *(
+        (
+            metrics.reliability,
+            (np.array([0.5, bad]), np.ones(2, bool)),
+            f"confidence = {bad} .*probabilities, 0 to 1",
+        )
+        for bad in (math.nan, -0.5, 1.5, math.inf)
+    ),
+    (metrics.reliability, (np.full(2, 0.5), np.ones(3, bool)), r"right = 'shape \(3,\)' .*\(2,\)"),
     (metrics.wilson, (0, 0), "trials = "),
     (metrics.wilson, (-1, 5), "hits = "),
     (metrics.wilson, (6, 5), "hits = "),

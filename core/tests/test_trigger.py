@@ -127,3 +127,8 @@ def test_coates_accepts_any_counts_dtype_and_leaves_it_alone() -> None:
 def test_more_detections_than_pulses_are_refused() -> None:
     with pytest.raises(ValueError, match=r"n_pulses = 5 .*at least 6, the detections of a pixel"):
         coates_rate([[1, 1], [3, 3]], 5)
+
+
+def test_negative_counts_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"counts = -1 .*non-negative"):
+        coates_rate([-1, 2], 10)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from numbers import Integral
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Capture, CaptureInfo
-from core.checks import require, require_type
+from core.checks import require, require_pixel, require_type
 from core.estimators import RangeImage, require_capture, settings_of
 from core.inference import RangeInterval
 from core.io.readers.npz import fields
@@ -276,9 +275,7 @@ def save_pixel(
     """
     path, _ = _path_and_suffix(path, (".csv",))
     settings = settings_of(method, settings)
-    for name, index, size in zip(("row", "col"), (row, col), capture.shape, strict=True):
-        inside = isinstance(index, Integral) and 0 <= index < size
-        require(name, index, inside, f"an integer from 0 to {size - 1}, within the image")
+    require_pixel(row, col, capture.shape)
     with whole_file(path, overwrite=overwrite) as file:
         table.write_pixel(capture, row, col, method, settings, file)
 
