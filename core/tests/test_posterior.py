@@ -31,6 +31,7 @@ from core.inference.posterior import (
     has_posterior,
     least_loss,
     posterior_of,
+    surface_probability,
     tolerance_probability,
 )
 from core.io.readers.dense import guess_detection
@@ -488,6 +489,13 @@ def test_confidences_are_those_of_the_posterior_to_the_last_bit(
     monkeypatch.setattr("core.inference.posterior.flux_model_of", lambda _: part)
     found = tolerance_probability(capture_of(cube[rows], 200), bins[rows])
     np.testing.assert_array_equal(found, alone[rows])
+
+
+def test_the_probability_of_a_surface_needs_no_table() -> None:
+    capture = capture_of(histograms(40, 200, Pulse()).reshape(3, 3, 40), 200)
+    alone = surface_probability(capture)
+    assert not has_posterior(capture)
+    np.testing.assert_array_equal(alone, posterior_of(capture).surface)
 
 
 def test_without_detections_the_posterior_is_uniform(monkeypatch: pytest.MonkeyPatch) -> None:
