@@ -37,7 +37,9 @@ class OutlierPixels(NamedTuple):
     bright: NDArray[np.bool_]
     """Significantly more counts than any neighbour, in an echo."""
     dead: NDArray[np.bool_]
-    """Significantly fewer counts than any neighbour."""
+    """Significantly fewer counts than any neighbour, and no echo."""
+    dark: NDArray[np.bool_]
+    """Significantly fewer counts than any neighbour, and an echo."""
     most: NDArray[np.int64]
     """Largest counts of a neighbour."""
     least: NDArray[np.int64]
@@ -68,30 +70,33 @@ def outlier_pixels(capture: Capture) -> OutlierPixels | None:
     hot, dead = counts > most, counts < least
     hot[hot] = probability_of_more(counts[hot], most[hot], n_pulses) < SIGNIFICANCE
     dead[dead] = probability_of_fewer(counts[dead], least[dead], n_pulses) < SIGNIFICANCE
-    bright = np.zeros_like(hot)
     width = min(_ECHO_LENGTHS * capture.echo_bins, capture.acquisition.n_bins)
-    bright[hot] = _is_bright(capture.cube[hot], most[hot], width, n_pulses)
-    return OutlierPixels(hot & ~bright, bright, dead, most, least)
+    bright, dark = np.zeros((2, *capture.shape), bool)
+    has_echo, beside = _echoes(capture.cube[hot], width, n_pulses)
+    # Their excess lies in the echo: the other bins do not hold significantly more.
+    bright[hot] = has_echo & (probability_of_more(beside, most[hot], n_pulses) >= SIGNIFICANCE)
+    dark[dead], _ = _echoes(capture.cube[dead], width, n_pulses)
+    return OutlierPixels(hot & ~bright, bright, dead & ~dark, dark, most, least)
 
 
-def _is_bright(
-    pixels: NDArray[np.unsignedinteger], most: NDArray[np.int64], width: int, n_pulses: int | None
-) -> NDArray[np.bool_]:
-    """Return whether the excess of pixels (pixel, bin) over `most` counts lies in an echo.
+def _echoes(
+    pixels: NDArray[np.unsignedinteger], width: int, n_pulses: int | None
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return whether pixels (pixel, bin) have an echo, and their counts beside it, at least one.
 
     The `width` bins with the largest counts hold significantly more of them than a detector fires
-    there that fires at a constant rate while it is armed, and the other bins do not hold
-    significantly more than `most`.
+    there that fires at a constant rate while it is armed.
     """
+    if not len(pixels):
+        return np.zeros(0, bool), np.zeros(0, np.int64)
     histograms = pixels.astype(float)
     _, armed = rate_and_n_armed(histograms, n_pulses)
     counts, inside = pixels.sum(axis=1, dtype=np.int64), windowed_sums(histograms, width)
     every, largest = np.arange(len(pixels)), inside.argmax(axis=1)
     echo, armed_in_echo = inside[every, largest], windowed_sums(armed, width)[every, largest]
     expected = counts * armed_in_echo / armed.sum(axis=1)
-    has_echo = probability_of_more(echo, expected, counts) < SIGNIFICANCE
-    rest = np.maximum(counts - echo, 1)
-    return has_echo & (probability_of_more(rest, most, n_pulses) >= SIGNIFICANCE)
+    has_echo = probability_of_more(echo, expected, np.maximum(counts, 1)) < SIGNIFICANCE
+    return has_echo, np.maximum(counts - echo, 1).astype(np.int64)
 
 
 def ordinary_pixels(capture: Capture) -> NDArray[np.bool_]:
@@ -123,6 +128,8 @@ def pixel_verdict(capture: Capture, row: int, col: int) -> PixelVerdict:
         health, why = "hot", "significantly more than any of them, spread over the gate"
     elif found.bright[row, col]:
         why = "significantly more than any of them, in the echo of a bright surface"
+    elif found.dark[row, col]:
+        why = "significantly fewer than any of them, with the echo of a dark surface"
     elif found.dead[row, col]:
         health, why = "dead", "significantly fewer than any of them"
     elif counts == 0:
@@ -152,4 +159,6 @@ def probability_of_fewer(
     """Probability of `counts` or fewer detections if `expected` are expected."""
     if n_pulses is None:
         return np.asarray(scipy.special.pdtr(counts, expected))
-    return np.asarray(scipy.special.bdtr(counts, n_pulses, np.divide(expected, n_pulses)))
+    # Where all pulses of the neighbours fire, another pixel may miss a few.
+    share = np.minimum(np.divide(expected, n_pulses), 1 - 1 / n_pulses)
+    return np.asarray(scipy.special.bdtr(counts, n_pulses, share))

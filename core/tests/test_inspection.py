@@ -22,6 +22,7 @@ from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.geometry import Box
 from core.inference import TOLERANCE_BINS
+from core.inference.faults import outlier_pixels, pixel_verdict, probability_of_fewer
 from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.maps import likeliest
@@ -350,6 +351,26 @@ def test_hot_and_dead_pixels_are_found() -> None:
     assert (
         inspection.pixel_report(dark, estimate(dark, "peak"), 1, 1).verdict.health == "cannot tell"
     )
+
+
+def test_a_dark_surface_between_bright_ones_is_not_dead() -> None:
+    scene = random_depths(24, seed=1)
+    reflectivity = np.random.default_rng(0).gamma(4.0, 0.25, scene.range_m.shape)
+    scene = replace(scene, reflectivity=reflectivity)
+    capture = simulate(scene, Acquisition(), Flux(3.0, sbr=10.0), seed=0)
+    assert inspection.capture_report(capture).n_dead == 0
+    row, col = np.argwhere(outlier_pixels(capture).dark)[0].tolist()
+    verdict = pixel_verdict(capture, row, col)
+    assert verdict.health == "ordinary" and "dark surface" in verdict.why
+    broken = capture.cube.copy()
+    broken[5, 6] = 0
+    found = inspection.faulty_pixels(replace(capture, cube=broken))
+    assert [(each.row, each.col) for each in found if each.health == "dead"] == [(5, 6)]
+
+
+def test_a_pixel_may_miss_pulses_that_its_neighbours_do_not() -> None:
+    assert probability_of_fewer(398, 400, 400) > 0.1
+    assert probability_of_fewer(200, 400, 400) < 1e-100
 
 
 @pytest.mark.parametrize("n_pulses", [None, 400])

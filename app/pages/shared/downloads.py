@@ -25,6 +25,7 @@ import param
 
 import core
 from app.model import download_text
+from app.model.colors import doubt
 from app.model.exports import Write, image_files, report_file
 from app.model.state import ALL, Crop, Viewing
 from app.model.store import Answer, Request
@@ -79,6 +80,8 @@ class Subject:
         Part of the scene, described in files.
     methods : mapping of str to str
         Settings of several estimators, described in files only.
+    remark : str
+        Why its confidences are unreliable, stated in files.
     """
 
     capture: str
@@ -89,6 +92,7 @@ class Subject:
     viewing: Viewing | None = None
     box: Box | None = None
     methods: Mapping[str, str] = field(default_factory=dict)
+    remark: str = ""
 
     @property
     def chosen(self) -> list[str]:
@@ -116,6 +120,7 @@ class Subject:
             *([f"box: {self.box}"] if self.box else []),
             *(f"method: {method}; settings: {each}" for method, each in self.methods.items()),
             *([f"source: {' '.join(self.source.split())}"] if self.source else []),
+            *([f"remark: {self.remark}"] if self.remark else []),
         ]
 
     def about(self, what: str) -> str:
@@ -323,8 +328,8 @@ def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> S
     """Return the subject of an estimate."""
     subject = looked_at(session, answer.request)
     settings = (*subject.settings, settings)
-    source = answer.capture.source
-    return replace(subject, estimator=estimator, settings=settings, source=source)
+    source, remark = answer.capture.source, doubt(answer)
+    return replace(subject, estimator=estimator, settings=settings, source=source, remark=remark)
 
 
 def explored(session: Session) -> Subject:
