@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.acquisition import Floats
+from core.acquisition import LONGEST_S, Floats
 from core.capture import Capture, cached_per_capture
 from core.inference.background import (
     echo_free,
@@ -58,7 +59,9 @@ _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _MANY_SPENT = 0.01  # share of the pixels with so few of them, which biases the mean total
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
-_MOST_AT_ECHOES = 1.5  # of the mean background; more is light of echoes longer than the pulse
+_MOST_AT_ECHOES = 1.5  # of the mean background; with more, one may be taken for the other
+_MOST_RISE = 1.1  # of that from the first round to the last; up to 1.02 if it is background
+_LONGER = 3.0, 6.0  # times the pulse, with which echoes may explain a shape of the background
 _RARE = 1e-3  # levels with a smaller share are left out
 _TINY = 1e-30  # likelihood of a level relative to the likeliest, whose logarithm is finite
 
@@ -123,13 +126,54 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
 
     The background is uniform over the gate unless bins without echoes contradict that. Then its
     shape and the other parameters are estimated in turn (`core.inference.background`).
+
+    A shape that is large at the echoes raises two doubts. Echoes over a uniform background may be
+    found where the background is in fact larger, which hides its shape there. The estimation then
+    also starts from the shape of all photons, and the likelier start is continued. On the other
+    hand, the shape may consist of photons of echoes that are longer than the pulse. Then longer
+    echoes over a uniform background are likelier, or the shape rises at the echoes from round to
+    round: echoes over a larger background explain fewer photons. A background does not depend on
+    the one that is assumed.
     """
-    found, shape = _flux_prior(capture, None)
-    for _ in range(_SHAPE_ROUNDS):
-        if shape is None and found.background_shape is None:
-            break
-        found, shape = _flux_prior(capture, shape)
-    return found
+    uniform, shapes = _flux_prior(capture, None)
+    if not shapes:
+        return uniform
+    first = shapes[0]
+    if len(shapes) == 1:
+        found, shapes = _flux_prior(capture, first)
+    else:
+        starts = [_flux_prior(capture, shape) for shape in shapes]
+        likelihoods = [_log_likelihood(capture, start) for start, _ in starts]
+        if max(likelihoods) < _of_longer_echoes(capture):
+            return uniform
+        found, shapes = starts[int(np.argmax(likelihoods))]
+    for _ in range(_SHAPE_ROUNDS - 1):
+        if not shapes:
+            return uniform
+        found, shapes = _flux_prior(capture, shapes[0])
+    at_echoes = _at_echoes(found.relative_background, found)
+    has_risen = at_echoes > _MOST_RISE * _at_echoes(first, found)
+    return uniform if at_echoes > _MOST_AT_ECHOES and has_risen else found
+
+
+def _of_longer_echoes(capture: Capture) -> float:
+    """Largest `_log_likelihood` of echoes longer than the pulse over a uniform background."""
+    pulse, likelihoods = capture.pulse, []
+    longest_s = LONGEST_S / max(len(pulse.samples), 1)
+    for stretch in _LONGER:
+        longer = replace(pulse, tau_s=min(stretch * pulse.tau_s, longest_s))
+        as_if = replace(capture, pulse=longer)
+        likelihoods.append(_log_likelihood(as_if, _flux_prior(as_if, None)[0]))
+    return max(likelihoods)
+
+
+def _at_echoes(shape: Floats, flux_prior: FluxPrior) -> float:
+    """Mean of a background shape over the delays of echoes."""
+    return float(np.average(shape, weights=flux_prior.depth))
+
+
+_Shapes = tuple[Floats, ...]
+"""Background shapes to try, the one to doubt least first; none if it is uniform."""
 
 
 class _Background(NamedTuple):
@@ -137,8 +181,7 @@ class _Background(NamedTuple):
 
     mean: float
     """Photons per pulse over the gate; NaN if no bin is free of echoes."""
-    shape: Floats | None
-    """`FluxPrior.background_shape`."""
+    shapes: _Shapes
 
 
 def _background(
@@ -151,25 +194,23 @@ def _background(
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     total = _totals(capture)[0].ravel()[pixels]
     flux = known.model(total[np.newaxis], _least_background(capture))
-    free = echo_free(
-        density,
-        known.share[:, np.newaxis] * known.depth,
-        flux.background[:, 0].T,
-        capture.cube.reshape(-1, n_bins)[pixels],
-        n_pulses,
-        echo_window(capture),
-        known.relative_background,
-    )
+    seen = capture.cube.reshape(-1, n_bins)[pixels], n_pulses, echo_window(capture)
+    guess, background = known.relative_background, flux.background[:, 0].T
+    free = echo_free(density, known.share[:, np.newaxis] * known.depth, background, *seen, guess)
+    mean = mean_background(free, n_pulses is not None, guess)
     shape = fitted_shape(free) if pixels.size >= _FEWEST_OF_SHAPE else None
-    if shape is not None and np.average(shape, weights=known.depth) > _MOST_AT_ECHOES:
-        shape = None
-    return _Background(
-        mean_background(free, n_pulses is not None, known.relative_background), shape
-    )
+    if shape is None:
+        return _Background(mean, ())
+    if known.background_shape is not None or _at_echoes(shape, known) <= _MOST_AT_ECHOES:
+        return _Background(mean, (shape,))
+    alone = np.ones((pixels.size, 1, n_bins), np.float32)
+    everything = echo_free(alone, np.ones((1, n_bins)), background[:, :1], *seen, guess)
+    other = fitted_shape(everything)
+    return _Background(mean, (shape,) if other is None else (shape, other))
 
 
-def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floats | None]:
-    """Estimate `detailed_flux_prior_of` with a shape of the background, and a better shape.
+def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, _Shapes]:
+    """Estimate `detailed_flux_prior_of` with a shape of the background, and better shapes.
 
     The total rate of a pixel (Coates 1968) is signal plus background. The total minus a signal
     level is shrunk towards the mean background of the image as far as its scatter is explained by
@@ -202,18 +243,16 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
             background=total.ravel()[some].mean() - signal_share * mean,
             own_weight=_own_weight(total, chance + variance),
         )
-    prior, free_shape = _completed(capture, found, share)
+    prior, shapes = _completed(capture, found, share)
     if _mean_log_likelihood(levels_of, share) < _CLEAR:
-        other, other_shape = _completed(capture, found, _shares_of_one_level(capture, start))
+        other, other_shapes = _completed(capture, found, _shares_of_one_level(capture, start))
         gain = _log_likelihood(capture, other) - _log_likelihood(capture, prior)
         if gain > _LEAST_JOINT_GAIN:
-            return other, other_shape
-    return prior, free_shape
+            return other, other_shapes
+    return prior, shapes
 
 
-def _completed(
-    capture: Capture, found: FluxPrior, share: Floats
-) -> tuple[FluxPrior, Floats | None]:
+def _completed(capture: Capture, found: FluxPrior, share: Floats) -> tuple[FluxPrior, _Shapes]:
     """Return `_flux_prior`, given the shares of the coarse grid of levels that `found` has."""
     total, _, signal_share, spent = _totals(capture)
     mean = signal_share * (share @ found.levels)
@@ -240,7 +279,7 @@ def _completed(
         levels = levels * ((total.mean() - background) / (share @ levels))
     found = found._replace(levels=levels, share=share, background=np.asarray(background))
     contrast = found.model(total, _least_background(capture)).contrast
-    return found._replace(contrast=contrast), free.shape
+    return found._replace(contrast=contrast), free.shapes
 
 
 def _sampled_densities(

@@ -8,13 +8,14 @@ from scipy import stats
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
+from core.estimators import estimate
 from core.estimators.base import histogram_numbers
 from core.inference.background import SIZE, echo_free, nodes_of, shape_text
 from core.inference.fit import fit_of
 from core.inference.flux import flux_prior_of
 from core.inspection import capture_report
 from core.studies.methods import alarms
-from core.studies.methods.calibration import FluxRegime
+from core.studies.methods.calibration import FluxRegime, confidence_and_right
 from core.studies.methods.fit import NULL_CASES
 from core.trigger import draw_counts, rate_per_bin
 
@@ -179,3 +180,55 @@ def test_shapes_are_described_by_what_they_do() -> None:
 def test_echoes_longer_than_the_pulse_are_not_taken_for_background(seed: int) -> None:
     captures, _ = FluxRegime("all", "middle", "twice as long").captures(seed)
     assert flux_prior_of(captures[0]).background_shape is None
+
+
+FAINT = {
+    "decays by the middle": np.exp(-3 * TIME),
+    "decays soon": np.exp(-np.arange(100) / 30),
+    "afterglow": 1 + 4 * np.exp(-np.arange(100) / 3),
+}
+"""Shapes over which faint echoes seem to lie where the background is largest."""
+
+
+def faint(shape: np.ndarray, delays: tuple[float, float], signal: float) -> Capture:
+    """Capture with echoes over one photon of background per pulse."""
+    rng, acquisition = np.random.default_rng(1), Acquisition(n_pulses=1000)
+    onset = rng.uniform(*delays, (SIDE, SIDE))
+    rate = rate_per_bin(onset, np.full(onset.shape, signal), 0.0, Pulse(), acquisition)
+    counts = draw_counts(rate + shape / shape.sum(), 1000, rng)
+    return Capture(counts, acquisition, Pulse(), acquisition.bin_to_range_m(onset))
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    ("shape", "delays", "signal"),
+    [
+        ("decays by the middle", (15, 85), 0.08),
+        ("decays soon", (15, 85), 0.1),
+        ("decays soon", (45, 55), 0.05),  # also echoes hide the shape
+        ("decays soon", (8, 18), 0.05),  # the shape is large at the echoes, too
+        ("afterglow", (15, 85), 0.15),
+    ],
+)
+def test_echoes_are_not_found_where_the_background_is_large(
+    shape: str, delays: tuple[float, float], signal: float
+) -> None:
+    true = FAINT[shape] / FAINT[shape].mean()
+    capture = faint(true, delays, signal)
+    found = flux_prior_of(capture).background_shape
+    assert found is not None
+    assert np.sqrt(((found / true - 1) ** 2).mean()) < 0.025
+    confidence, is_right = confidence_and_right(capture, estimate(capture, "likelihood"))
+    assert is_right.mean() > 0.93
+    # Three standard deviations of a share, and the error of one estimate of the fluxes.
+    assert confidence.mean() == pytest.approx(is_right.mean(), abs=0.03)
+    assert "background" not in fit_of(capture).remark
+
+
+@pytest.mark.compiled
+def test_much_longer_echoes_are_not_taken_for_background() -> None:
+    rng, acquisition = np.random.default_rng(1), Acquisition(n_pulses=100)
+    onset = rng.uniform(45, 55, (SIDE, SIDE))
+    rate = rate_per_bin(onset, np.ones(onset.shape), 0.3, Pulse(6e-9), acquisition)
+    capture = Capture(draw_counts(rate, 100, rng), acquisition, Pulse())
+    assert flux_prior_of(capture).background_shape is None

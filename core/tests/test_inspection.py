@@ -654,15 +654,24 @@ def test_fluxes_of_a_dim_car_are_those_of_all_its_pixels() -> None:
     assert abs(found.signal.value - signal) < 0.06 * signal
 
 
-@pytest.mark.parametrize(("regime", "n_fog"), [(0, 20), (4, 120)], ids=["known", "darkest"])
-def test_a_report_says_where_bins_without_echoes_contradict_the_model(
-    regime: int, n_fog: int
-) -> None:
+def foggy_report(regime: int, n_fog: int) -> inspection.CaptureReport:
+    """Return the report on a capture with half a photon of fog in each of the first bins."""
     captures, _ = FLUX_REGIMES[regime].captures(seed=4)
     capture, rng = captures[-1], np.random.default_rng(4)
-    # Fog: photons that return from the first bins.
     cube = capture.cube + rng.poisson(0.5, capture.cube.shape) * (np.arange(150) < n_fog)
-    report = inspection.capture_report(replace(capture, cube=cube.astype(np.uint32)))
+    return inspection.capture_report(replace(capture, cube=cube.astype(np.uint32)))
+
+
+def test_a_report_names_fog_as_the_shape_of_the_background() -> None:
+    report = foggy_report(regime=0, n_fog=20)
+    assert "disagree" not in report.flux_remark
+    assert "the background varies over the gate" in report.flux_remark
+    # 10 photons of fog and 0.25 of background, but no smooth shape.
+    assert report.flux.background.value == pytest.approx(10.25, rel=0.1)
+
+
+def test_a_report_says_where_bins_without_echoes_contradict_the_model() -> None:
+    report = foggy_report(regime=4, n_fog=120)
     free = report.echo_free_background
     assert free is not None and "disagree" in report.flux_remark
     assert report.flux.background.high > 1.5 * report.flux.background.low
