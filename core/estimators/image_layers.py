@@ -7,9 +7,10 @@ given the second, and so on, `_ROUNDS` times.
 
 The fluxes of both layers and the background are those of the pixels around, by expectation and
 maximisation: neighbours share them, and a single pixel of few photons does not show them. How many
-pixels have a second surface is the mean of their probabilities. Layers closer than
-`_LEAST_DISTANCE_BINS` are one. A second surface is accepted if it is likelier than all but a given
-share of those in an image that is drawn with the first layer alone.
+pixels have a second surface, how strong it is and how alike neighbours are in that is learned from
+the evidence of the pixels by themselves: a net has holes. Layers closer than `_LEAST_DISTANCE_BINS`
+are one. A second surface is accepted if it is likelier than all but a given share of those in an
+image that is drawn with the first layer alone.
 """
 
 from __future__ import annotations
@@ -23,12 +24,14 @@ from numpy.typing import NDArray
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.estimators.image_model import (
+    Pairs,
     Prior,
     image_model_of,
     merged_bins,
     merged_flux,
 )
 from core.estimators.image_posterior import image_posterior_of, peaks, slopes_of, solved
+from core.inference.flux import level_shares
 from core.inference.flux_model import Agreement
 from core.inference.posterior import TOLERANCE_BINS, States
 from core.inference.returns import FALSE_RETURN, echo_model, pixel_counts
@@ -39,14 +42,15 @@ from core.trigger import draw_counts
 _ROUNDS = 3
 _FLUX_STEPS = 3  # of expectation and maximisation, in each round
 _WINDOW = 9  # rows and columns whose pixels share their fluxes
-_LEVELS = np.array([[1.0, 0.75, 0.5, 0.25], [0.7, 0.5, 0.3, 0.15]])
+_LEVELS = np.array([[0.25, 0.5, 0.75, 1.0], [0.15, 0.3, 0.5, 0.7]])
 """Signals of one more echo in each layer, relative to both."""
 
 _FIRST_SHARES = np.array([0.7, 0.3])  # of the layers in the signal, before it is fitted
 _LEAST_DISTANCE_BINS = 2.0
 _LIKELY = 0.5  # probability from which a pixel has a second surface
-_FIRST_SHARE = 0.1  # of the pixels that have one, before any is seen
-_LEAST_SHARE, _MOST_SHARE = 1e-4, 1 - 1e-4
+_ALIKE = np.full(_LEVELS.shape[1], 1 / _LEVELS.shape[1])  # shares of levels
+_SAMPLE = 1024  # pixels from which shares of levels are learned
+_LEAST_SHARE = 1e-4
 _IMPOSSIBLE = -1e4
 _LEAST = 1e-20  # probability of a state, so that no product of messages is subnormal
 _LEAST_FLUX = 1e-9
@@ -95,20 +99,25 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
     alone = image_posterior_of(capture, flux)
     merged, factor = merged_bins(capture)
     flux = merged_flux(flux, factor)
-    shape, prior = merged.shape, Prior.of(flux)
-    image = _Image(pixel_counts(merged.cube), echo_model(merged), shape, prior, flux.agreement)
+    shape = merged.shape
+    image = _Image(
+        pixel_counts(merged.cube), echo_model(merged), shape, Prior.of(flux), flux.agreement
+    )
     first, delay = alone.by_bin.copy(), np.zeros((2, *shape))
     delay[0] = alone.delay / factor
     slopes: list[NDArray[np.float32] | None] = [alone.slopes, None]
     present = np.stack([alone.surface > 1 - _LIKELY, np.zeros(shape, bool)])
     signal = np.stack([flux.typical_signal.ravel(), np.zeros(delay[0].size)])
     fluxes = _local(image, _Fluxes(flux.typical_background.ravel(), signal), delay, present)
-    share = _FIRST_SHARE
     for number in range(_ROUNDS):
-        second = _second_layer(image, fluxes, delay[0], present[0], share, slopes[1])
+        only = np.stack([present[0], np.zeros(shape, bool)])
+        share = _level_shares(image, fluxes, delay[0], only)
+        log = _log_ratios(image, fluxes, 1, delay[0], only, share[1:])
+        prior = _with_nothing(image.prior, float(share[0]))
+        agreement = _agreement(image, _states(log, prior), prior)
+        second = solved(_states(log, prior), prior, agreement, slopes[1])
         delay[1], weight = peaks(second.surface)
         slopes[1] = slopes_of(delay[1], weight)
-        share = float(np.clip(1 - second.nothing[present[0]].mean(), _LEAST_SHARE, _MOST_SHARE))
         present[1] = present[0] & (second.nothing < _LIKELY) & _apart(delay)
         if not present[1].any():
             break
@@ -116,14 +125,16 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
             total = fluxes.signal[0]
             fluxes = fluxes._replace(signal=_FIRST_SHARES[:, np.newaxis] * total)
         fluxes = _local(image, fluxes, delay, present)
-        evidence = _evidence(image, fluxes, 0, delay[1], present, prior.nothing)
-        again = solved(evidence, prior, flux.agreement, slopes[0])
+        log = _log_ratios(image, fluxes, 0, delay[1], present, _ALIKE)
+        again = solved(_states(log, image.prior), image.prior, flux.agreement, slopes[0])
         found, weight = peaks(again.surface)
         delay[0] = np.where(present[1], found, delay[0])
         first[present[1]] = again.surface[present[1]]
         slopes[0] = slopes_of(delay[0], weight)
     if present[1].any():
-        least = _nothing_of_one_surface(capture, image, fluxes, delay[0], present[0], share)
+        drawn = _with_one_surface(capture, image, fluxes, delay[0], present[0])
+        log = _log_ratios(*drawn, 1, delay[0], only, share[1:])
+        least = solved(_states(log, prior), prior, agreement).nothing
         most = min(_LIKELY, float(np.quantile(least[present[0]], false_return)))
         present[1] &= (second.nothing < most) & _apart(delay)
     confidence = np.stack([_mass(first, delay[0]), _mass(second.surface, delay[1])])
@@ -135,30 +146,47 @@ def _apart(delay: Floats) -> NDArray[np.bool_]:
     return np.asarray(np.abs(delay[1] - delay[0]) >= _LEAST_DISTANCE_BINS)
 
 
-def _second_layer(
-    image: _Image,
-    fluxes: _Fluxes,
-    delay: Floats,
-    present: NDArray[np.bool_],
-    share: float,
-    slopes: NDArray[np.float32] | None,
-) -> States:
-    """Find the second layer, given the delays (row, col) of the first and where it is present."""
-    only = np.stack([present, np.zeros_like(present)])
-    evidence = _evidence(image, fluxes, 1, delay, only, 1 - share)
-    prior = _with_nothing(image.prior, 1 - share)
-    return solved(evidence, prior, image.agreement, slopes)
+def _level_shares(image: _Image, fluxes: _Fluxes, delay: Floats, only: NDArray[np.bool_]) -> Floats:
+    """Learn the shares of pixels without a second surface and with one of each level, (1 + level,).
+
+    From pixels by themselves, given delays (row, col) of the first surface, which is where `only`
+    (layer, row, col) says. What neighbours say would confirm itself: a net would have no holes.
+    """
+    pixels = np.flatnonzero(only[0])
+    if pixels.size > _SAMPLE:
+        pixels = np.sort(np.random.default_rng(0).permutation(pixels)[:_SAMPLE])
+    some = image._replace(counts=image.counts[pixels], shape=(1, pixels.size))
+    given = _Fluxes(fluxes.background[pixels], fluxes.signal[:, pixels])
+    first, there = delay.ravel()[np.newaxis, pixels], only.reshape(2, 1, -1)[..., pixels]
+    depth = image.prior.surface / image.prior.surface.sum()
+    n_levels = _LEVELS.shape[1]
+    log = np.zeros((pixels.size, 1 + n_levels))
+    for level in range(n_levels):
+        found = _log_ratios(some, given, 1, first, there, np.eye(n_levels)[level])[0].astype(float)
+        top = found.max(axis=1)
+        log[:, 1 + level] = top + np.log(np.exp(found - top[:, np.newaxis]) @ depth)
+    share = level_shares(np.exp(log - log.max(axis=1, keepdims=True)))
+    share = np.maximum(share, _LEAST_SHARE)
+    return np.asarray(share / share.sum())
 
 
-def _nothing_of_one_surface(
+def _agreement(image: _Image, alone: States, prior: Prior) -> Agreement:
+    """Return how alike neighbours are in a layer, which may have holes that the first has not."""
+    pairs = Pairs.among(alone, prior)
+    alike = image.agreement.alike if pairs is None else pairs.likeliest().alike
+    # None are alike where pixels by themselves show nothing.
+    is_less = 0 < alike < image.agreement.alike
+    return image.agreement._replace(alike=alike) if is_less else image.agreement
+
+
+def _with_one_surface(
     capture: Capture,
     image: _Image,
     fluxes: _Fluxes,
     delay: Floats,
     present: NDArray[np.bool_],
-    share: float,
-) -> NDArray[np.float32]:
-    """Return the probabilities of no second surface in an image drawn with the first alone."""
+) -> tuple[_Image, _Fluxes]:
+    """Draw an image with the first layer alone, which has all of the signal."""
     n_bins = image.counts.shape[1]
     whole = fluxes.signal.sum(axis=0)
     echo = capture.pulse.bin_probability(
@@ -167,9 +195,8 @@ def _nothing_of_one_surface(
     rate = fluxes.background[:, np.newaxis] * image.model.background
     rate += np.where(present.ravel(), whole, 0.0)[:, np.newaxis] * echo
     counts = pixel_counts(draw_counts(rate, capture.gated_pulses, np.random.default_rng(0)))
-    drawn = image._replace(counts=counts)
     one = fluxes._replace(signal=np.stack([whole, np.zeros_like(whole)]))
-    return _second_layer(drawn, one, delay, present, share, None).nothing
+    return image._replace(counts=counts), one
 
 
 def _with_nothing(prior: Prior, nothing: float) -> Prior:
@@ -177,30 +204,31 @@ def _with_nothing(prior: Prior, nothing: float) -> Prior:
     return Prior(prior.surface * (1 - nothing) / (1 - prior.nothing), nothing)
 
 
-def _evidence(
+def _log_ratios(
     image: _Image,
     fluxes: _Fluxes,
     layer: int,
     delay: Floats,
     present: NDArray[np.bool_],
-    nothing: float,
-) -> States:
-    """Return the evidence of a layer, given the delays (row, col) of the other one.
+    share: Floats,
+) -> NDArray[np.float32]:
+    """Log likelihood ratios of a surface of a layer to none, (row, col, bin), given the other.
 
-    `present` (layer, row, col) says where the other one is, and which pixels have the layer's
-    photons counted as signal; `nothing` is the prior probability of no surface.
+    The other layer has delays (row, col); `present` (layer, row, col) says where it is, and which
+    pixels have the layer's photons counted as signal. No second surface is without a first. `share`
+    (level,) is that of each of the layer's `_LEVELS`.
     """
     signal, other, is_there = fluxes.signal, 1 - layer, present.reshape(2, -1)
     unexplained = fluxes.background + np.where(is_there[layer], signal[layer], 0.0)
     known = np.where(is_there[other], signal[other], 0.0)
-    levels = _LEVELS[layer, :, np.newaxis] * signal.sum(axis=0)
-    log = np.empty(image.counts.shape, np.float32)
+    some = share > 0
+    levels = _LEVELS[layer, some, np.newaxis] * signal.sum(axis=0)
+    weight, log = np.log(share[some] / share.sum()), np.empty(image.counts.shape, np.float32)
     given = image.counts, image.model, unexplained, known[np.newaxis], delay.reshape(1, -1)
-    on_threads(fill_further, len(log), log.size * _BIN_COST, *given, levels, log)
+    on_threads(fill_further, len(log), log.size * _BIN_COST, *given, levels, weight, log)
     if layer == 1:
-        log[~is_there[0]] = _IMPOSSIBLE  # no second surface without a first
-    log -= np.float32(np.log(len(levels)))
-    return _states(log.reshape(*image.shape, -1), _with_nothing(image.prior, nothing))
+        log[~is_there[0]] = _IMPOSSIBLE
+    return log.reshape(*image.shape, -1)
 
 
 def _local(image: _Image, fluxes: _Fluxes, delay: Floats, present: NDArray[np.bool_]) -> _Fluxes:

@@ -170,15 +170,34 @@ class Pairs(NamedTuple):
     def of(cls, capture: Capture, flux: FluxModel) -> Pairs | None:
         """Choose pairs and compute their posteriors; None if there are too few."""
         capture, factor = merged_bins(capture)
-        flux, (rows, cols) = merged_flux(flux, factor), capture.shape
+        flux, pixels = merged_flux(flux, factor), cls._chosen(*capture.shape)
+        if pixels is None:
+            return None
+        return cls._of(states_of_pixels(capture, flux, pixels), Prior.of(flux))
+
+    @classmethod
+    def among(cls, alone: States, prior: Prior) -> Pairs | None:
+        """Choose pairs from the posteriors of the pixels of an image by themselves."""
+        pixels = cls._chosen(*alone.nothing.shape)
+        if pixels is None:
+            return None
+        surface = alone.surface.reshape(-1, alone.surface.shape[2])[pixels]
+        return cls._of(States(surface, alone.nothing.ravel()[pixels]), prior)
+
+    @staticmethod
+    def _chosen(rows: int, cols: int) -> NDArray[np.intp] | None:
+        """Choose pixels, followed by their right and by their lower neighbours, by flat index."""
         if min(rows, cols) < 2 or rows * cols < FEWEST_PIXELS:
             return None
         at = np.random.default_rng(0).permutation((rows - 1) * (cols - 1))[:_PAIRS]
         one = at // (cols - 1) * cols + at % (cols - 1)
-        found = states_of_pixels(capture, flux, np.concatenate([one, one + 1, one + cols]))
-        surface = found.surface.reshape(3, one.size, -1)
-        nothing = found.nothing.reshape(3, one.size).astype(float)
-        return cls(surface, nothing, Prior.of(flux))
+        return np.concatenate([one, one + 1, one + cols])
+
+    @classmethod
+    def _of(cls, chosen: States, prior: Prior) -> Pairs:
+        n_pairs = chosen.nothing.size // 3
+        surface = chosen.surface.reshape(3, n_pairs, -1)
+        return cls(surface, chosen.nothing.reshape(3, n_pairs).astype(float), prior)
 
     def are_clear(self) -> bool:
         """Return whether pixels with a surface tell by themselves where it is.
@@ -193,19 +212,23 @@ class Pairs(NamedTuple):
         return mean < _FEW_BINS and float(surface.sum()) >= FEWEST_PIXELS
 
     def agreement(self) -> Agreement:
-        """Find how similar neighbours are."""
+        """Find how similar neighbours are; unrelated if pairs at random are half as similar."""
+        best, chance = self.likeliest(), 0.0
         apart = self.nothing.shape[1] // 2  # pixels are in random order
-        ratios = self.ratios(0)
-        by_chance = self.ratios(apart)
-        best, chance = UNRELATED, 0.0
-        for scale, ratio, random in zip(SCALES_BINS, ratios, by_chance, strict=True):
-            chance = max(chance, float(_likeliest_share(random)[1].mean()))
+        for ratio in self.ratios(apart):
+            chance = max(chance, float(_likeliest_share(ratio)[1].mean()))
+        left = best.gain - chance
+        return best._replace(gain=left) if left > 0.5 * best.gain else UNRELATED
+
+    def likeliest(self) -> Agreement:
+        """Find the likeliest similarity of neighbours, be it by chance."""
+        best = UNRELATED
+        for scale, ratio in zip(SCALES_BINS, self.ratios(0), strict=True):
             share, gain = _likeliest_share(ratio)
             mean, error = float(gain.mean()), float(gain.std()) / math.sqrt(gain.size)
             if mean > max(best.gain, _SURE * error):
                 best = Agreement(mean, share, scale)
-        left = best.gain - chance
-        return best._replace(gain=left) if left > 0.5 * best.gain else UNRELATED
+        return best
 
     def ratios(self, apart: int) -> Floats:
         """Compute c of each scale and of pixels and the neighbours of others, (scale, pair)."""

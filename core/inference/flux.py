@@ -236,7 +236,7 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, _Sha
         flux = found.model(total.ravel()[some], least)
         evidence = level_evidence(prepare(capture, flat[some], flux, 1))
         levels_of = _relative(evidence)
-        share = _shares(levels_of.likelihood)
+        share = level_shares(levels_of.likelihood)
         mean = np.asarray(share @ levels)
         variance = float(share @ (levels - mean) ** 2)
         found = found._replace(
@@ -264,7 +264,7 @@ def _completed(capture: Capture, found: FluxPrior, share: Floats) -> tuple[FluxP
     likelihood = _evidence(density, depth).likelihood
     found = found._replace(share=share, depth=depth)
     free = _background(capture, found, pixels, density)
-    share = _shares(likelihood)
+    share = level_shares(likelihood)
     learn_shares(likelihood, share)  # of the levels that are left
     levels, share = _joined(found.levels, share, pair)
     kept = _kept(share)
@@ -558,7 +558,7 @@ def _kept(share: Floats) -> NDArray[np.bool_]:
     return kept
 
 
-def _shares(likelihood: Floats) -> Floats:
+def level_shares(likelihood: Floats) -> Floats:
     """Estimate the shares of levels from the likelihood of each, as `_Evidence.likelihood`.
 
     A tenth of an additional pixel has no echo, so that its share is never 0. The faintest levels

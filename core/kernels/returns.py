@@ -480,7 +480,7 @@ def _add_logarithms(one, log):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED, inline="always")
-def _fill_further(i, counts, model, background, signal, delay, levels, log):  # type: ignore[no-untyped-def]
+def _fill_further(i, counts, model, background, signal, delay, levels, weight, log):  # type: ignore[no-untyped-def]
     """Fill `log` (bin,) of one pixel, see `fill_further`."""
     n_bins, n_taps, middle = counts.size, model.echo.shape[1], (model.echo.shape[0] - 1) // 2
     pixel, before, after = _pixel(counts, model), np.empty(n_bins), np.empty(n_bins)
@@ -497,7 +497,7 @@ def _fill_further(i, counts, model, background, signal, delay, levels, log):  # 
         s = levels[level, i]
         left = max(background[i] - s, 0.1 * background[i])
         _fill_more(i, model, left, signal, delay, after)
-        base, ratio, gained = (background[i] - left) * exposure, 1.0, 0.0
+        base, ratio, gained = weight[level] + (background[i] - left) * exposure, 1.0, 0.0
         for k in range(n_bins):
             per_more[k] = 1.0 / after[k]
         for k in pixel.fired:
@@ -525,7 +525,7 @@ def _fill_further(i, counts, model, background, signal, delay, levels, log):  # 
 
 
 @njit(**COMPILED)
-def fill_further(first, end, counts, model, background, signal, delay, levels, log):  # type: ignore[no-untyped-def]
+def fill_further(first, end, counts, model, background, signal, delay, levels, weight, log):  # type: ignore[no-untyped-def]
     """Fill the log likelihood ratio of one more echo in the middle of each bin to none.
 
     Its photons are taken from the background; the ratio is the sum over its `levels`.
@@ -540,13 +540,15 @@ def fill_further(first, end, counts, model, background, signal, delay, levels, l
         Echoes that are known; a signal of 0 for none.
     levels : ndarray, shape (level, pixel)
         Signals of one more echo.
+    weight : ndarray, shape (level,)
+        Logarithms of their probabilities.
     log : ndarray of float32, shape (pixel, bin)
     """
     none = np.float32(-1e30)
     for i in range(first, end):
         for k in range(log.shape[1]):
             log[i, k] = none
-        _fill_further(i, counts[i], model, background, signal, delay, levels, log[i])
+        _fill_further(i, counts[i], model, background, signal, delay, levels, weight, log[i])
 
 
 @njit(**COMPILED)

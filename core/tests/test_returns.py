@@ -17,7 +17,7 @@ from core.effects import SecondSurface
 from core.inference import FALSE_RETURN
 from core.inference.returns import fitted_echoes
 from core.scene import net
-from core.trigger import draw_counts
+from core.trigger import draw_counts, rate_per_bin
 
 compiled = pytest.mark.compiled  # all but the test that compares the kernel with its definition
 
@@ -204,6 +204,24 @@ def test_neighbours_add_no_second_surface_to_one() -> None:
     assert returns is not None
     false = np.count_nonzero(returns.count(capture.shape) > 1)
     assert false <= binom.ppf(0.9999, capture.counts.size, FALSE_RETURN)
+
+
+@compiled
+def test_holes_of_a_net_get_no_second_surface() -> None:
+    """All strands are as bright, so that hardly any surface in a hole is faint."""
+    row, col = np.mgrid[:64, :64]
+    is_strand = (row % 4 == 0) | (col % 4 == 0)
+    acquisition = Acquisition(n_pulses=100)
+    wall, front = (
+        rate_per_bin(onset, np.full(onset.shape, 0.1), 0.0, Pulse(), acquisition)
+        for onset in (55 + 10 * col / 64, np.full(row.shape, 20.0))
+    )
+    rate = wall + np.where(is_strand[..., np.newaxis], front, 0.0) + 0.3 / acquisition.n_bins
+    counts = draw_counts(rate, acquisition.n_pulses, np.random.default_rng(2))
+    image = core.estimate(core.Capture(counts, acquisition), "image_posterior", returns=2)
+    has_two = image.returns.count(counts.shape[:2]) > 1
+    assert has_two[~is_strand].mean() < 0.05
+    assert has_two[is_strand].mean() > 0.85
 
 
 @compiled
