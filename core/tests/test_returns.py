@@ -207,21 +207,21 @@ def test_neighbours_add_no_second_surface_to_one() -> None:
 
 
 @compiled
-def test_holes_of_a_net_get_no_second_surface() -> None:
+def test_few_holes_of_a_net_get_a_second_surface() -> None:
     """All strands are as bright, so that hardly any surface in a hole is faint."""
-    row, col = np.mgrid[:64, :64]
-    is_strand = (row % 4 == 0) | (col % 4 == 0)
-    acquisition = Acquisition(n_pulses=100)
+    col = np.mgrid[:64, :64][1]
+    is_strand = np.random.default_rng(3).random(col.shape) < 0.3
+    acquisition = Acquisition(n_pulses=1000)
     wall, front = (
-        rate_per_bin(onset, np.full(onset.shape, 0.1), 0.0, Pulse(), acquisition)
-        for onset in (55 + 10 * col / 64, np.full(row.shape, 20.0))
+        rate_per_bin(onset, np.full(onset.shape, 0.05), 0.0, Pulse(), acquisition)
+        for onset in (55 + 10 * col / 64, np.full(col.shape, 20.0))
     )
-    rate = wall + np.where(is_strand[..., np.newaxis], front, 0.0) + 0.3 / acquisition.n_bins
+    rate = wall + np.where(is_strand[..., np.newaxis], front, 0.0) + 1 / acquisition.n_bins
     counts = draw_counts(rate, acquisition.n_pulses, np.random.default_rng(2))
     image = core.estimate(core.Capture(counts, acquisition), "image_posterior", returns=2)
-    has_two = image.returns.count(counts.shape[:2]) > 1
+    has_two = image.returns.count(col.shape) > 1
     assert has_two[~is_strand].mean() < 0.05
-    assert has_two[is_strand].mean() > 0.85
+    assert has_two[is_strand].mean() > 0.8
 
 
 @compiled
