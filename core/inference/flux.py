@@ -140,8 +140,8 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     uniform, shapes = _flux_prior(capture, None)
     if not shapes:
         return uniform
-    first, is_doubtful = shapes[0], len(shapes) > 1
-    if not is_doubtful:
+    first, is_doubtful = shapes[0], _at_echoes(shapes[0], uniform) > _MOST_AT_ECHOES
+    if len(shapes) == 1:
         found, shapes = _flux_prior(capture, first)
     else:
         starts = [_flux_prior(capture, shape) for shape in shapes]

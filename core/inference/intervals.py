@@ -72,7 +72,8 @@ def range_intervals(
     They are calibrated: of the estimates within `TOLERANCE_BINS` of the surface, a share of each
     level have an interval that contains the range of the surface. Whether a surface is there is
     what `RangeImage.confidence` says. Echoes that fire nearly every pulse, of more than about four
-    photons per pulse, hide their flux: their intervals are too narrow.
+    photons per pulse, hide their flux: their intervals are too narrow. So are those of surfaces
+    that move, since they are computed as if these were at rest.
 
     Parameters
     ----------
