@@ -89,7 +89,7 @@ class _Image(NamedTuple):
 
 @cached_per_capture
 def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Layers | None:
-    """Find two layers of surfaces; None where neighbours carry no information.
+    """Find two layers of surfaces; None if neighbours carry no information or see no surface.
 
     At most a share `false_return` of the pixels with one surface has a second.
     """
@@ -107,6 +107,8 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
     delay[0] = alone.delay / factor
     slopes: list[NDArray[np.float32] | None] = [alone.slopes, None]
     present = np.stack([alone.surface > 1 - _LIKELY, np.zeros(shape, bool)])
+    if not present.any():
+        return None
     signal = np.stack([flux.typical_signal.ravel(), np.zeros(delay[0].size)])
     fluxes = _local(image, _Fluxes(flux.typical_background.ravel(), signal), delay, present)
     for number in range(_ROUNDS):
@@ -114,8 +116,9 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
         share = _level_shares(image, fluxes, delay[0], only)
         log = _log_ratios(image, fluxes, 1, delay[0], only, share[1:])
         prior = _with_nothing(image.prior, float(share[0]))
-        agreement = _agreement(image, _states(log, prior), prior)
-        second = solved(_states(log, prior), prior, agreement, slopes[1])
+        own = _states(log, prior)
+        agreement = _agreement(image, own, prior)
+        second = solved(own, prior, agreement, slopes[1])
         delay[1], weight = peaks(second.surface)
         slopes[1] = slopes_of(delay[1], weight)
         present[1] = present[0] & (second.nothing < _LIKELY) & _apart(delay)
