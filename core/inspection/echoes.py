@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from itertools import pairwise
 from typing import NamedTuple
@@ -120,8 +120,12 @@ def _flux_of(
 
 
 def total_flux(capture: Capture) -> Interval | None:
-    """Estimate signal and background together, likewise; None if too few pulses are left."""
-    parts = _photons_between(capture, [0, capture.acquisition.n_bins])
+    """Estimate signal and background together, likewise.
+
+    None if a mean pixel has too few pulses left. Pixels without any raise the total too little, but
+    by less than is known of them.
+    """
+    parts = _photons_between(capture, [0, capture.acquisition.n_bins], np.mean)
     if parts is None:
         return None
     pulses = 1 if capture.gated_pulses else capture.acquisition.n_pulses or 1
@@ -172,8 +176,13 @@ class _Photons(NamedTuple):
         return Interval(total, low, high)
 
 
-def _photons_between(capture: Capture, ends: Sequence[int]) -> list[_Photons] | None:
-    """Photons of the ordinary pixels between successive bins; None if too few pulses are left."""
+def _photons_between(
+    capture: Capture, ends: Sequence[int], of_pixels: Callable[..., np.number] = np.min
+) -> list[_Photons] | None:
+    """Photons of the ordinary pixels between successive bins; None if too few pulses are left.
+
+    By default in any pixel, or in the mean one.
+    """
     kept, n_pulses = capture.cube[ordinary_pixels(capture)], capture.gated_pulses
     counts = np.stack(
         [kept[:, first:end].sum(axis=1, dtype=np.int64) for first, end in pairwise(ends)]
@@ -181,7 +190,7 @@ def _photons_between(capture: Capture, ends: Sequence[int]) -> list[_Photons] | 
     if n_pulses is None:
         return [_Photons(float(each.sum()), float(each.sum()), 1.0) for each in counts]
     left = n_pulses - np.cumsum(counts, axis=0)
-    if left.min() < _FEWEST_ARMED:
+    if of_pixels(left, axis=1).min() < _FEWEST_ARMED:
         return None
     return list(map(_fired, left + counts, left))
 
@@ -189,8 +198,10 @@ def _photons_between(capture: Capture, ends: Sequence[int]) -> list[_Photons] | 
 def _fired(armed: NDArray[np.int64], left: NDArray[np.int64]) -> _Photons:
     """Photons per pulse of all pixels (pixel,) while pulses fired (Coates 1968).
 
-    With the variance of Greenwood (1926), by half of which a logarithm is biased.
+    With the variance of Greenwood (1926). Half a pulse more on either side removes most of the bias
+    of the logarithm (Anscombe 1956).
     """
-    variance = 1 / left - 1 / armed
-    rate = np.log(armed / left) - variance / 2
-    return _Photons(float(rate.sum()), float(variance.sum()), 1 / float(left.min()))
+    before, after = armed + 0.5, left + 0.5
+    variance = 1 / after - 1 / before
+    rate = np.log(before / after)
+    return _Photons(float(rate.sum()), float(variance.sum()), 1 / float(after.min()))

@@ -5,6 +5,9 @@ an echo, with a gamma distributed signal of unknown shape. The likelihoods of th
 over uniform delays, give a likelihood of mean signal and mean background, maximised over share and
 shape, and profile likelihood intervals as for a single pixel (`core.inspection.flux`).
 
+Where pixels differ in their backgrounds, the likelihood only gives the signal; the mean background
+is what it leaves of the total.
+
 The maximum-likelihood gamma distribution has the mean of the observed signals, whatever their
 true distribution, so that the model need not be exact where signals are clear.
 
@@ -140,7 +143,11 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     some, share = _dimmer(ordinary)
     mixture, scale = _Mixture(some), 1.0 if acquisition.n_pulses else 1 / share
     model, target = (each.of(some).scaled(scale) for each in (mixture.image, mixture.target))
-    whole = _with_total(model, total_flux(ordinary))
+    total = total_flux(ordinary)
+    if mixture.has_own_backgrounds and total is not None:
+        whole = _below_total(model.signal, total)
+    else:
+        whole = _with_total(model, total)
     # The share of target pixels in a sample differs from that of the image, by chance.
     is_whole = n_pixels <= _SAMPLE
     signal = (
@@ -153,6 +160,12 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     is_darkest = bool(free is None and darkest and darkest.background.high < whole.background.low)
     free = darkest if is_darkest else free
     return _combined(MeanFlux(whole, target, whole, free, mixture.pulse, is_darkest))
+
+
+def _below_total(signal: Interval, total: Interval) -> FluxEstimate:
+    """Return the fluxes of pixels with backgrounds of their own, which the signal leaves."""
+    background = difference_of(total, signal)
+    return FluxEstimate(signal, background, ratio_of(signal, background))
 
 
 def _with_total(model: FluxEstimate, total: Interval | None) -> FluxEstimate:
@@ -283,20 +296,30 @@ class _Mixture:
             capture.acquisition.bin_width_s / _SAMPLES_PER_BIN,
         )
         self.pulse, centre = fit.pulse, math.log(background) + fit.background * half
+        least = math.log(1e-4 / n_pulses / pixels.size)  # beyond: no bound
+        most = math.log(1000 * (background + top + capture.acquisition.n_bins))
+        if self.has_own_backgrounds:
+            least, most = centre - half, centre + half
         box = Box(
             low=(centre - half, 0.6 * math.sqrt(mean)),
             high=(centre + half, 1.3 * math.sqrt(mean)),
-            least=(math.log(1e-4 / n_pulses / pixels.size), 0.0),  # beyond: no bound
-            most=(
-                math.log(1000 * (background + top + capture.acquisition.n_bins)),
-                math.sqrt(top),
-            ),
+            least=(least, 0.0),
+            most=(most, math.sqrt(top)),
         )
         self._tabulate(box.low[0], box.high[0])
         box, self.image = self._estimated(box, of_target=False)
         bright = min(math.sqrt(bright), box.most[1] / 2)
         box = box._replace(low=(box.low[0], 0.8 * bright), high=(box.high[0], 1.2 * bright))
         self.target = self._estimated(box, of_target=True)[1]
+
+    @property
+    def has_own_backgrounds(self) -> bool:
+        """Whether pixels differ in their backgrounds.
+
+        That of a pixel is then about its total less its signal, of which the likelihood of a mean
+        background knows nothing.
+        """
+        return self._known.own_weight > 0
 
     def _estimated(self, box: Box, of_target: bool) -> tuple[Box, FluxEstimate]:
         """Estimate the fluxes of the mean pixel, or of the mean target pixel, from a box."""

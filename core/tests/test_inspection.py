@@ -586,6 +586,20 @@ def test_mean_flux_intervals_cover_the_truth(
             assert each.value - 2 * below < true < each.value + 2 * above
 
 
+def test_the_mean_background_is_found_where_pixels_differ() -> None:
+    """Half of the pixels see a third of the background of the others."""
+    half, signal, backgrounds = random_depths(16), 0.1, (0.75, 2.25)
+    captures = [simulate(half, ACQUISITION, Flux(signal, signal / each)) for each in backgrounds]
+    both = Capture(np.concatenate([each.cube for each in captures]), ACQUISITION)
+    mean = np.mean(backgrounds)
+    for each, true in zip(
+        inspection.estimate_mean_flux(both), (signal, mean, signal / mean), strict=True
+    ):
+        assert each.high < 1.2 * each.low
+        below, above = each.value - each.low, each.high - each.value
+        assert each.value - 2 * below < true < each.value + 2 * above
+
+
 def test_bright_echoes_have_the_length_of_their_pulse() -> None:
     """Between delays that are tried, they would seem shorter, and fainter."""
     for seed in range(2):
