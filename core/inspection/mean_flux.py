@@ -153,7 +153,7 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     signal = (
         _at_same_share(target.signal, model.signal, whole.signal) if is_whole else target.signal
     )
-    if signal != target.signal:
+    if signal != target.signal or mixture.has_own_backgrounds:
         sbr = ratio_of(signal, whole.background)
         target = FluxEstimate(signal, whole.background, sbr)
     free, darkest = echo_free_flux(capture), darkest_flux(capture)
