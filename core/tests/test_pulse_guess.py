@@ -206,6 +206,32 @@ def test_a_wall_all_at_one_range() -> None:
         np.testing.assert_allclose(np.array(found, float), sigma_bins, rtol=0.1)
 
 
+def bright(shape: str, signal: float, background: float, seed: int) -> Cube:
+    """First photons of 1000 pulses of sigma 2 bins, from a slope: 32 x 32 pixels, 128 bins."""
+    depths = np.linspace(40, 80, 32) + np.zeros((32, 1))
+    since_echo = np.arange(129) - depths[..., np.newaxis]
+    before = signal * cumulative(shape, since_echo, 2.0) + background * np.linspace(0, 1, 129)
+    shares = np.diff(-np.expm1(-before), append=1.0)
+    counts = np.random.default_rng(seed).multinomial(1000, shares)[..., :-1]
+    return np.asarray(counts.astype(np.uint16))
+
+
+@pytest.mark.parametrize("shape", ["gaussian", "gamma"])
+def test_a_bright_pulse_is_not_shortened_by_pile_up(shape: str) -> None:
+    """Its first photons alone come from the leading edge, and fewer follow than lead."""
+    for signal, background in ((3.0, 0.3), (1.0, 2.0)):
+        guesses = [pulse_guess(bright(shape, signal, background, s), 1000) for s in range(4)]
+        found = [guess for guess in guesses if guess and guess.shape == shape]
+        assert len(found) == len(guesses) and all(guess.is_determined for guess in found)
+        tau = 2.0 / (np.sqrt(2) if shape == "gamma" else 1.0)
+        inside = [guess.low_bins < tau < guess.high_bins for guess in found]
+        assert sum(inside) >= binom.ppf(0.001, len(inside), 1 - 2 * student.sf(3, 31))
+
+
+def test_nothing_is_estimated_where_no_pulse_is_left() -> None:
+    assert pulse_guess(bright("gaussian", 1.0, 7.0, 0), 1000) is None
+
+
 @pytest.mark.parametrize("sbr", [1.0, 0.06, 0.01])
 def test_nothing_is_estimated_without_an_echo(sbr: float) -> None:
     """Up to ten background photons a pulse, whose first ones decay within ten bins."""

@@ -84,9 +84,12 @@ def description_of(
     interval = ""
     if pulse is None or detection is None:
         counts = sample()
-        if pulse is None:
-            pulse, interval = guessed_pulse(counts, acquisition.bin_width_s)
         detection = detection or guess_detection(counts, acquisition.n_pulses)
+        if pulse is None:
+            first_of = acquisition.n_pulses if detection == "first" else None
+            pulse, interval = guessed_pulse(counts, acquisition.bin_width_s, first_of)
+            if detection == "first" and first_of is None:
+                interval += ", as shortened by pile-up: the number of pulses is not known"
     found = list(guessed)
     if time_unit_s is not None and request.time_unit_s is None:
         found.append(f"time unit {time_text(time_unit_s)}")
