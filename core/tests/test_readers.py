@@ -20,6 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.special import ndtr
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
@@ -209,8 +210,23 @@ def test_own_layout_keeps_every_field(write: Write) -> None:
 def test_own_layout_lists_guesses_for_missing_fields(write: Write) -> None:
     path = write("a.npz", npz_bytes(cube=CUBE, bin_width_s=5e-10, n_pulses=0, source="a wall"))
     capture = read_capture(path, gate_delay_s=2e-7)
-    assert capture.acquisition.n_pulses is None and capture.pulse == Pulse()
-    assert capture.source == "a wall; guessed: pulse gamma of 1 ns, all photons of a pulse"
+    assert capture.acquisition.n_pulses is None and capture.pulse == Pulse.gaussian(5e-10)
+    guessed = "pulse Gaussian of 500 ps (one bin: width not determined), all photons of a pulse"
+    assert capture.source == f"a wall; guessed: {guessed}"
+
+
+def test_own_layout_without_a_pulse_has_the_one_of_its_counts(write: Write) -> None:
+    """As other files have, and told in the same words."""
+    slope = 30 + np.arange(20) / 2 + np.zeros((20, 1))
+    echo = 3.0 * ndtr((np.arange(81) - slope[..., np.newaxis]) / 2)
+    shares = np.diff(-np.expm1(-echo), append=1.0)
+    shares[..., -1] = 1 - shares[..., :-1].sum(axis=-1)
+    cube = np.random.default_rng(0).multinomial(300, shares)[..., :-1].astype(np.uint16)
+    own = read_capture(write("a.npz", npz_bytes(cube=cube, n_pulses=300)))
+    other = read_capture(write("b.npz", npz_bytes(counts=cube, n_pulses=300)), axes="row col bin")
+    assert own.pulse == other.pulse and own.pulse.shape == "gaussian"
+    assert own.pulse.tau_s == pytest.approx(2e-9, rel=0.05)  # 11 % less with pile-up
+    assert own.source.partition("; ")[2] == other.source.partition("; ")[2]
 
 
 def test_numbers_of_the_own_layout_accompany_counts_of_another_name(write: Write) -> None:

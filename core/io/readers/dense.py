@@ -51,7 +51,6 @@ def description_of(
     time_unit_s: float | None = None,
     bin_width_s: float = 1e-9,
     gate_delay_s: float = 0.0,
-    assumed_pulse: Pulse | None = None,
     remark: str = "",
 ) -> Description:
     """Describe counts by a request, and guess what it leaves open.
@@ -68,8 +67,6 @@ def description_of(
         Unit taken for arrival times; None for a file that holds none.
     bin_width_s, gate_delay_s : float
         Used where the request specifies none.
-    assumed_pulse : Pulse, optional
-        Used where the request specifies none, in place of one guessed from the counts.
     remark : str
         Appended to the source.
     """
@@ -80,7 +77,7 @@ def description_of(
         n_pulses=request.n_pulses,
         pixel_angle_rad=request.pixel_angle_rad,
     )
-    pulse, detection = request.pulse or assumed_pulse, request.detection
+    pulse, detection = request.pulse, request.detection
     interval = ""
     if pulse is None or detection is None:
         counts = sample()
@@ -156,7 +153,6 @@ def dense_capture(
     *,
     guessed: Sequence[str] = (),
     bin_width_s: float | None = None,
-    assumed_pulse: Pulse | None = None,
 ) -> Capture:
     """Build a capture from counts (row, col, bin), which are reversed for a common stop.
 
@@ -183,7 +179,6 @@ def dense_capture(
         guessed=guessed,
         bin_width_s=bin_width_s,
         gate_delay_s=opens_s,
-        assumed_pulse=assumed_pulse,
     )
     return capture_of(counts, known)
 

@@ -25,9 +25,9 @@ field                 shape           meaning
 ====================  ==============  ==========================================================
 
 Text is an array of one unicode string. Where timing or pulse are absent they are guessed: bins of
-1 ns, a gate that opens with the pulse, and the default pulse. An archive of other names opens too
-if exactly one array has three axes, or if ``variable`` names one; the scalars of the table are used
-there, too, and the pulse is guessed from the counts.
+1 ns, a gate that opens with the pulse, and the pulse from the counts. An archive of other names
+opens too if exactly one array has three axes, or if ``variable`` names one; the scalars of the
+table are used there, too, but no pulse.
 
 In place of a cube there may be raw ``frames`` (pulse, row, col) of trigger bins with a whole number
 ``no_trigger`` that marks no trigger, as in `core.io.readers.frames`; the other fields may
@@ -47,7 +47,7 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from core.acquisition import Floats, Pulse
+from core.acquisition import Floats
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import AXES, cube_capture, dense_capture, stored_counts, with_guesses
@@ -148,7 +148,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
             in_order = request.order(AXES) in (None, (0, 1, 2))
             require("axes", request.axes, in_order, repr(" ".join(AXES)))
             counts = stored_counts(_array(archive, name), name)
-            capture = dense_capture(counts, origin, complete, assumed_pulse=Pulse())
+            capture = dense_capture(counts, origin, complete)
         if request.pulse is None:
             require_pulse_in_gate(capture.pulse, capture.acquisition)
         return replace(
