@@ -91,6 +91,28 @@ def test_frames_in_which_0_is_no_trigger_are_no_cube(
     np.testing.assert_array_equal(read_capture(path, axes="row col bin").cube, stack)
 
 
+@pytest.mark.parametrize("share", [0.7, 0.9, 0.97])
+def test_frames_in_which_most_pixels_fire_are_no_cube(share: float) -> None:
+    """Half of the light is background over 100 bins, half from a slope."""
+    rng = np.random.default_rng(1)
+    shape, half = (200, 24, 24), -np.log1p(-share) / 2
+    echo = np.where(rng.random(shape) < -np.expm1(-half), 20 + 2 * np.arange(24), 1000)
+    first = np.minimum(1 + (rng.exponential(100 / half, shape)).astype(int), echo)
+    stack = np.where(first <= 100, first, 0)
+    assert np.count_nonzero(stack) == pytest.approx(share * stack.size, rel=0.01)
+    assert resembles_frames(stack)
+    assert not resembles_frames(np.where(stack == 0, 1, stack))
+
+
+@pytest.mark.parametrize("dead", [0.02, 0.6])
+def test_counts_with_dead_pixels_are_not_taken_for_frames(dead: float) -> None:
+    rng = np.random.default_rng(2)
+    counts = rng.poisson(30.0, (64, 48, 100))
+    counts[rng.random(counts.shape[:2]) < dead] = 0
+    for axes in itertools.permutations(range(3)):
+        assert not resembles_frames(counts.transpose(axes))
+
+
 def surfaces(kind: str) -> NDArray[np.int64]:
     """Bins (row, col) at which echoes of a wall, a slope or random depths begin."""
     row, col = np.indices((64, 48))
