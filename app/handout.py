@@ -204,8 +204,8 @@ def _check(lesson: Lesson, is_key: bool) -> str:
     hints = f"<table><tr><th>Wrong answer</th><th>What to say</th></tr>{wrong}</table>"
     return (
         _rendered(check.question)
-        + f'<p class="key"><strong>{check.answer:.3g}</strong> ± {check.tolerance:g}</p>'
-        + (hints if wrong else "")
+        + f'<p class="key"><strong>{check.answer:.3g}</strong>, accepted within '
+        f"{check.tolerance:g}</p>" + (hints if wrong else "")
     )
 
 

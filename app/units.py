@@ -88,8 +88,10 @@ def plus_minus(low: float, high: float, unit: str) -> Quantity:
     return Quantity(text, middle, unit, low, high, decimals=decimals)
 
 
-def with_margin(found: Interval, unit: str) -> Quantity:
+def with_margin(found: Interval, unit: str, note: str = "") -> Quantity:
     """Format an estimate with a margin that includes its interval; without one as `number`.
+
+    A remark on the margin follows in brackets.
 
     The estimate of a method need not be the middle of the interval: the margin is the distance to
     the farther end.
@@ -99,8 +101,8 @@ def with_margin(found: Interval, unit: str) -> Quantity:
     if decimals is None:
         return number(found.value, unit)
     text = typeset(f"{found.value:,.{decimals}f} ± {margin:.{decimals}f}")
-    text = f"{text} {unit}".strip()
-    return Quantity(text, found.value, unit, found.low, found.high, decimals=decimals)
+    text = f"{text} {unit}".strip() + (f" ({note})" if note else "")
+    return Quantity(text, found.value, unit, found.low, found.high, note, decimals)
 
 
 def between(low: float, high: float, unit: str) -> Quantity:

@@ -105,7 +105,8 @@ class Tuning:
             return f"{tried} None restored more than the defaults: RD {self.default_rd:.3f}."
         compared = (
             f"On a second one of {self.n_targets:,} targets, the best restored {self.best_rd:.3f} "
-            f"and the defaults {self.default_rd:.3f} (difference ± {self.error:.3f})."
+            f"and the defaults {self.default_rd:.3f} (standard error of the difference: "
+            f"{self.error:.3f})."
         )
         kept = "the defaults are kept" if self.is_default else "the best are chosen"
         return f"{tried} {compared} They differ by {self._in_errors} standard errors: {kept}."

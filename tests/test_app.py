@@ -334,14 +334,12 @@ def test_figures_and_numbers_are_cores(car):
     image, sigma, settings = car.run.image, car.capture.cube[32, 30].std(), TrackingParameters()
     assert numbers["Pixel"] == "row 32, col 30"
     report = core.inspection.pixel_report(car.capture, image, 32, 30)
-    inner, outer = report.interval_68_m, report.interval_95_m
-    middle_m, half_m = (inner.low + inner.high) / 2, (inner.high - inner.low) / 2
-    assert 0.01 <= half_m < 0.1, "two digits are three decimals"
-    assert numbers["Range (68 %)"] == f"{middle_m:.3f} ± {half_m:.3f} m"
-    assert numbers["Range (95 %)"] == f"{outer.low:.2f}–{outer.high:.2f} m"
-    assert (numbers["Range (95 %)"].low, numbers["Range (95 %)"].high) == (outer.low, outer.high)
-    assert numbers["Estimate"] == f"{image.range_m[32, 30]:.3f} m"
-    assert numbers["Truth"] == f"{car.capture.truth_range_m[32, 30]:.3f} m"
+    low, high = report.interval_95_m.low, report.interval_95_m.high
+    assert 0.1 <= (high - low) / 2 < 1, "two digits are two decimals"
+    assert numbers["Range (95 %)"] == f"{(low + high) / 2:.2f} ± {(high - low) / 2:.2f} m"
+    assert (numbers["Range (95 %)"].low, numbers["Range (95 %)"].high) == (low, high)
+    assert numbers["Estimate"] == f"{image.range_m[32, 30]:.2f} m"
+    assert numbers["Truth"] == f"{car.capture.truth_range_m[32, 30]:.2f} m"
     assert numbers["σ"] == f"{sigma:.4g} counts"
     assert numbers["r small"] == f"{settings.l * sigma:.4g}"
     assert numbers["r large"] == f"{settings.n * settings.l * sigma:.4g}"

@@ -89,7 +89,7 @@ def test_the_limit_is_known_where_truth_and_flux_are(car):
     reference = ranking.reference_of(car.capture)
     assert reference.limit is not None and reference.likelihood is None
     (limit,) = text.rows(car.capture, {}, {}, reference, {})
-    assert "± 0.5 percentage points" in [below for _, _, below in limit["cells"]]
+    assert "off by at most 0.5 percentage points" in [below for _, _, below in limit["cells"]]
     rows = rows_of(car, ("peak", "oracle"), reference)
     n_cells = len(text.columns(car.capture)) - 1
     assert [len(row["cells"]) for row in rows] == [n_cells] * 3
@@ -236,11 +236,11 @@ def test_captions_have_intervals_where_the_confidence_suffices(car):
     known = image.valid & np.isfinite(car.capture.truth_range_m)
     number = r"[\d,.]+"
     for among, margin in (
-        (known & (image.confidence >= CONFIDENT), f" ± {number}"),
-        (known & (image.confidence < CONFIDENT), ""),
+        (known & (image.confidence >= CONFIDENT), rf" ± {number} m \(95 %\)"),
+        (known & (image.confidence < CONFIDENT), " m"),
     ):
         found = text.caption(car, *np.argwhere(among)[0])
-        expected = rf"{number}{margin} m \([+−]{number}\), confidence \d+ %"
+        expected = rf"{number}{margin} \([+−]{number}\), confidence \d+ %"
         assert re.fullmatch(expected, found)
 
 

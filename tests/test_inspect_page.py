@@ -125,7 +125,7 @@ def test_axes_facts_and_table_follow_the_unit_without_new_curves(far):
         ("bins", "Bin", "Range (m)"),
     ):
         far.state.unit = unit
-        far.tasks.run_until(lambda title=title: section.table.columns[1][0] == title)
+        far.tasks.run_until(lambda title=title: section.table.columns[1][0] == f"{title}, ± 95 %")
         assert (figure.below[0].axis_label, figure.above[0].axis_label) == (title, opposite)
         along = scale(unit, far.answer.gate)
         position = section.table.rows[0]["cells"][0][0]
@@ -594,7 +594,7 @@ def test_an_estimate_is_kept_and_subtracted_from_another(near, tmp_path, monkeyp
     pixel = near.state.pixel
     for name, image in (("A here", image_a), ("B here", image_b)):
         assert numbers[name].value == image.range_m[pixel]
-        assert (" ± " in numbers[name]) == (image.confidence[pixel] >= 0.9)
+        assert numbers[name].endswith(" m (95 %)") == (image.confidence[pixel] >= 0.9)
     assert numbers["In both"] == f"{np.isfinite(difference_m).sum():,}"
     assert numbers["Only in A"] == f"{(shown[0] & ~shown[1]).sum():,}"
     assert "SBR0.3" in section.a.title.text and "Coates" in section.b.title.text

@@ -571,9 +571,8 @@ class Pixel:
     truth_bin: float
     answer_bin: float
     range_m: float
-    interval_68_m: Interval
-    """The estimate with the 68 % interval of the range of the surface (`core.range_interval`)."""
     interval_95_m: Interval
+    """The estimate with the 95 % interval of the range of the surface (`core.range_interval`)."""
     truth_m: float
     has_target: bool | None
     """None where the truth is unknown."""
@@ -607,10 +606,10 @@ def inspect(answer: Answer, row: int, col: int, report: PixelReport | None = Non
     if answer.method == "tracking":
         signals = tracking_signals(histogram, answer.settings, capture.gated_pulses)
     if report is not None:
-        score, inner, outer = report.curve, report.interval_68_m, report.interval_95_m
+        score, interval_m = report.curve, report.interval_95_m
     else:
         score = ESTIMATORS[answer.method].curves(capture, row, col, answer.settings)
-        inner, outer = pixel_range_intervals(capture, image, row, col)
+        (interval_m,) = pixel_range_intervals(capture, image, row, col, (0.95,))
     return Pixel(
         row,
         col,
@@ -622,8 +621,7 @@ def inspect(answer: Answer, row: int, col: int, report: PixelReport | None = Non
         float(acquisition.range_m_to_bin(truth_m)),
         float(image.bin[row, col]),
         float(image.range_m[row, col]),
-        inner,
-        outer,
+        interval_m,
         truth_m,
         None if capture.truth_range_m is None else bool(np.isfinite(truth_m)),
         float(image.confidence[row, col]),

@@ -11,7 +11,7 @@ from app.model.large import Grid
 from app.model.methods import METHOD_TITLES
 from app.model.state import AUTOMATIC
 from app.model.store import Answer, Pixel, Refused
-from app.units import Quantity, Scale, between, plus_minus, with_margin
+from app.units import Quantity, Scale, plus_minus, with_margin
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
 from app.units import share as share  # noqa: PLC0414
@@ -43,12 +43,12 @@ CONFIDENCE_HELP = (
 
 RANGE_HELP = (
     "Range of the surface from the photons of this pixel, if there is one within 3 bins of the "
-    "estimate: {} of such intervals contain it."
+    "estimate: the middle of its 95 % interval and half the width."
 )
 
 ESTIMATE_HELP = (
-    "Estimate of the method, corrected for its lag. It may lie outside the intervals, which "
-    "describe the surface whatever the method."
+    "Estimate of the method, corrected for its lag. It may lie outside the interval, which "
+    "describes the surface whatever the method."
 )
 
 PER_PULSE, PER_PIXEL = "PPP", "Photons per pixel"
@@ -210,11 +210,10 @@ def interval_cell(found: Interval, form: str) -> Cell:
 
 def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
     """Return name, value and help of a pixel's estimate, compared with the truth if it is known."""
-    inner, outer = pixel.interval_68_m, pixel.interval_95_m
-    decimals = inner.decimals
+    interval_m = pixel.interval_95_m
+    decimals = interval_m.decimals
     facts: list[Fact] = [
-        ("Range (68 %)", plus_minus(inner.low, inner.high, "m"), RANGE_HELP.format("68 %")),
-        ("Range (95 %)", between(outer.low, outer.high, "m"), RANGE_HELP.format("95 %")),
+        ("Range (95 %)", plus_minus(interval_m.low, interval_m.high, "m"), RANGE_HELP),
         ("Estimate", number(pixel.range_m, "m", decimals=decimals), ESTIMATE_HELP),
     ]
     if along.name != "m":
@@ -229,9 +228,9 @@ def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
 
 
 def estimate_text(range_m: Interval, confidence: float, least_confidence: float) -> Quantity:
-    """Format an estimate in metres with its interval, of little confidence without a margin."""
+    """Format an estimate in metres, with its 95 % interval unless its confidence is too low."""
     if confidence >= least_confidence:
-        return with_margin(range_m, "m")
+        return with_margin(range_m, "m", "95 %")
     return number(range_m.value, "m", decimals=range_m.decimals)
 
 

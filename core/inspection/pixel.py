@@ -141,20 +141,17 @@ class PixelReport(OldFluxNames):
 
     @property
     def interval_text(self) -> str:
-        """Range of the surface with its intervals, as text; a dash without an estimate.
+        """Range of the surface with its 95 % interval, as text; a dash without an estimate.
 
-        Such as ``12.341 m ± 0.053 m (68 %), 12.236 to 12.448 m (95 %)``: the middle of the 68 %
-        interval and half its width, which has two significant digits.
+        Such as ``12.34 m ± 0.11 m (95 %)``: the middle of the interval and half its width, which
+        has two significant digits.
         """
-        inner, outer = self.interval_68_m, self.interval_95_m
-        half_m, middle_m = (inner.high - inner.low) / 2, (inner.high + inner.low) / 2
-        digits = inner.decimals
+        low_m, high_m = self.interval_95_m.low, self.interval_95_m.high
+        digits = self.interval_95_m.decimals
         if digits is None:
             return "–"
-        return (
-            f"{middle_m:.{digits}f} m ± {half_m:.{digits}f} m (68 %), "
-            f"{outer.low:.{digits}f} to {outer.high:.{digits}f} m (95 %)"
-        )
+        half_m, middle_m = (high_m - low_m) / 2, (high_m + low_m) / 2
+        return f"{middle_m:.{digits}f} m ± {half_m:.{digits}f} m (95 %)"
 
 
 def pixel_report(

@@ -301,9 +301,9 @@ def _pixel(
 ) -> Iterator[str]:
     acquisition, row, col = capture.acquisition, report.row, report.col
     truth_m = None if capture.truth_range_m is None else float(capture.truth_range_m[row, col])
-    inner, outer = report.interval_68_m, report.interval_95_m
+    interval_m = report.interval_95_m
     marks = {
-        "95 % interval": Mark(outer.low, outer.high, ESTIMATE),
+        "95 % interval": Mark(interval_m.low, interval_m.high, ESTIMATE),
         "estimate": _line(report.answer_m, ESTIMATE),
         **({} if truth_m is None else {"truth": _line(truth_m, TRUTH)}),
     }
@@ -312,13 +312,12 @@ def _pixel(
         signals = tracking_signals(report.counts, made_by.settings, capture.gated_pulses)
         histogram |= {"small scale": signals.small, "large scale": signals.large}
         stages = {"enhanced": signals.enhanced, "residual": signals.residual}
-    decimals, where = inner.decimals, f"row {row}, column {col}"
+    decimals, where = interval_m.decimals, f"row {row}, column {col}"
     yield _heading_2(f"Pixel in {where}")
     yield f'<p class="lead">Range: {_text(report.interval_text)}</p>'
     facts = [
         ("Estimate", _metres(report.answer_m, capture, decimals)),
-        ("68 % interval", _between(inner, capture, decimals)),
-        ("95 % interval", _between(outer, capture, decimals)),
+        ("95 % interval", _between(interval_m, capture, decimals)),
         ("Confidence", _number(report.confidence)),
         *(
             [("Radial velocity", _text(image.velocity.text_at(row, col)))]
@@ -330,17 +329,17 @@ def _pixel(
     ]
     if truth_m is not None:
         known = "no target" if math.isnan(truth_m) else _metres(truth_m, capture, decimals)
-        facts.insert(3, ("Truth", known))
+        facts.insert(2, ("Truth", known))
     if capture.reported_range_m is not None:
         reported_m = float(capture.reported_range_m[row, col])
         difference = _metres(report.answer_m - reported_m, capture, decimals)
-        facts[3:3] = [
+        facts[2:2] = [
             ("Reported by the sensor", _metres(reported_m, capture, decimals)),
             ("Estimate minus reported", difference),
         ]
     yield _facts(facts)
     yield (
-        '<p class="note">The intervals are those of the range of the surface, given that there is '
+        '<p class="note">The interval is that of the range of the surface, given that there is '
         "one within 3 bins of the estimate, which is what the confidence says.</p>"
     )
     drawn = [

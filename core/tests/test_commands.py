@@ -126,7 +126,8 @@ def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert pixel["candidate_1_range_m"] == pixel["range_m"]
     assert pixel["candidate_1_probability"] == pixel["confidence"]
     assert pixel["range_low_m"] < pixel["range_low_68_m"] < pixel["range_high_68_m"]
-    assert pixel["interval"].endswith(f"{pixel['range_high_m']:.3f} m (95 %)")
+    half_m = (pixel["range_high_m"] - pixel["range_low_m"]) / 2
+    assert pixel["interval"].endswith(f" ± {half_m:.3f} m (95 %)")
     assert pixel["verdict"] == "ordinary"
     assert pixel["reported_range_m"] == pytest.approx(reported_m[2, 3])
     difference_m = pixel["range_m"] - reported_m[2, 3]

@@ -154,13 +154,12 @@ def test_numbers_are_those_of_the_reports(source: str, page: Page, image: core.R
         assert page.values[name] == [number for each in found for number in astuple(each)]
     assert page.values["Hot pixels"] == [whole.n_hot]
     assert page.values["Estimate"] == [pixel.answer_m]
-    assert page.values["68 % interval"] == [pixel.interval_68_m.low, pixel.interval_68_m.high]
     assert page.values["95 % interval"] == [pixel.interval_95_m.low, pixel.interval_95_m.high]
     assert page.values["Confidence"] == [pixel.confidence]
     assert f"Range: {pixel.interval_text}" in page.texts["p"]
     fit = f"{share_below(fit_p_values(CAPTURE))} {fit_of(CAPTURE).verdict}"
     assert fit in page.texts["figcaption"]
-    assert f"{pixel.answer_m:.{pixel.interval_68_m.decimals}f}" in page.texts["data"]
+    assert f"{pixel.answer_m:.{pixel.interval_95_m.decimals}f}" in page.texts["data"]
     assert "T_n: " in source
     check = reported_check(CAPTURE, image)
     assert check is not None and check.n_pixels > 0

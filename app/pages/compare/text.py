@@ -193,7 +193,7 @@ def _limit_row(capture: Capture, reference: Reference | None) -> dict[str, Any]:
     floor = math.sqrt(float(np.mean(finite**2))) if finite.size else math.nan
     mean = float(np.nanmean(right)) if np.isfinite(right).any() else math.nan
     error = limits.approximation_error(mean, capture.acquisition.n_pulses or 1)
-    below = f"± {100 * error:g} percentage points" if math.isfinite(mean) else ""
+    below = f"off by at most {100 * error:g} percentage points" if math.isfinite(mean) else ""
     known = {
         "Within 3 bins": percent_cell(mean, below),
         "Inlier RMSE (m)": cell(floor, below="Cramér–Rao"),

@@ -156,7 +156,7 @@ def _reported_facts(answer: Answer, pixel: Pixel) -> list[Fact]:
     if answer.capture.reported_range_m is None:
         return []
     reported_m = float(answer.capture.reported_range_m[pixel.row, pixel.col])
-    decimals = pixel.interval_68_m.decimals
+    decimals = pixel.interval_95_m.decimals
     difference = number(pixel.range_m - reported_m, "m", sign=True, decimals=decimals)
     return [
         ("Reported", number(reported_m, "m", decimals=decimals), "Distance that the sensor found."),
@@ -271,8 +271,8 @@ def pair_pixel_facts(pair: Pair, row: int, col: int, least_confidence: float) ->
     difference = number(b_m.value - a_m.value, "m", sign=True, decimals=coarser)
     return [
         ("Pixel", pixel_name((row, col), pair.b.grid), "Row and column."),
-        ("A here", texts[0], "Estimate of A, shown or not; ± 95 % where it is shown."),
-        ("B here", texts[1], "Estimate of B, shown or not; ± 95 % where it is shown."),
+        ("A here", texts[0], "Estimate of A; with its 95 % interval if it is shown."),
+        ("B here", texts[1], "Estimate of B; with its 95 % interval if it is shown."),
         ("B − A here", difference, "Difference of the two."),
     ]
 
@@ -306,11 +306,16 @@ def fit_explanation(p_value: float) -> str:
     )
 
 
+def with_95(along: Scale) -> str:
+    """Return the title of a column of positions with their intervals."""
+    return f"{along.title}, ± 95 %"
+
+
 def candidate_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the candidates' columns."""
     return [
         ("Rank", "Rank by score.", 1),
-        (along.title, "Position along the gate, the estimator's lag removed, ± 95 %.", 1),
+        (with_95(along), "Position along the gate with its 95 % interval, the lag removed.", 1),
         ("Score", "The estimator's score; below, relative to the best.", -1),
         ("Probability", "Probability of a surface within 3 bins.", -1),
     ]
@@ -354,7 +359,7 @@ def pin_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the pins' columns."""
     return [
         ("Pixel", "Row and column.", 1),
-        (along.title, "The estimate along the gate, ± 95 %.", 1),
+        (with_95(along), "The estimate along the gate with its 95 % interval.", 1),
         ("Confidence", CONFIDENCE_HELP, -1),
         ("SBR", "Signal divided by background; below, its 95 % interval.", -1),
         ("Verdict", "Whether the pixel is hot or dead.", 1),
