@@ -322,9 +322,23 @@ def test_a_file_has_no_oracle_no_limit_and_no_errors(stage):
     assert stage.messages["Single-pixel limit"] == text.LIMIT_UNKNOWN
     assert "Error" not in stage.page.kind.options
     assert text.AGREEMENT_ONLY in stage.page.remarks.text
-    sentences = text.remarks(stage.session.answer.capture, 1, 1).split(". ")
+    sentences = stage.page.remarks.text.split(". ")
     assert len(sentences) == len(set(sentences)) > 1
     show_in_every_way(stage.page)
+
+
+def test_remarks_are_those_of_the_chosen_methods_with_their_settings(car):
+    tasks = [task_of(method, false_alarm=0.1) for method in ("peak", "kde", "chi", "unmixing")]
+    alone = replace(tasks[1], settings=replace(tasks[1].settings, neighbourhood="1x1"))
+    titles = f"{METHOD_TITLES['kde']}, {METHOD_TITLES['chi']}"
+    next_to_surfaces = "next to surfaces, a larger share of empty pixels get a range"
+    of_all = text.remarks(car.capture, tasks, 4)
+    assert f"{titles}: {next_to_surfaces}" in of_all
+    assert f"{METHOD_TITLES['unmixing']}: the share of false alarms is not controlled" in of_all
+    assert "kept by τ_FA" in of_all
+    for others in ([tasks[0], alone], [task_of("kde"), task_of("chi")]):
+        assert next_to_surfaces not in text.remarks(car.capture, others, 2)
+    assert f"{next_to_surfaces.capitalize()}" in text.remarks(car.capture, tasks[1:2], 1)
 
 
 def test_all_methods_fit_in_the_table_and_the_first_six_have_pictures(stage):

@@ -559,9 +559,11 @@ class Compare(Section):
             if isinstance(each, Result) and each.accuracy is not None
         }
         self._reliability.update(lines, styles)
-        n_working = sum(not isinstance(each, str) for each in found.values())
         if has_fit(capture):
-            self.remarks.text = text.remarks(capture, n_working, len(self.pictured))
+            working = [
+                task for task in tasks.values() if not isinstance(self.results.get(task), str)
+            ]
+            self.remarks.text = text.remarks(capture, working, len(self.pictured))
 
     def _mark_pixel(self) -> None:
         row, col = self.session.state.pixel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -295,13 +295,24 @@ def legend(pictures: Mapping[str, Unseen], least_confidence: float) -> str:
     return " ".join(sentences)
 
 
-def remarks(capture: Capture, n_working: int, n_pictures: int) -> str:
-    """Return remarks on the comparison; empty if there are none."""
+def remarks(capture: Capture, working: Sequence[Task], n_pictures: int) -> str:
+    """Return remarks on the comparison of the methods that work here; empty if there are none.
+
+    Those on some of the methods begin with their names.
+    """
+    methods_of: dict[str, list[str]] = {}
+    for task in working:
+        remark = ESTIMATORS[task.method].remark(capture, task.false_alarm, task.settings)
+        for clause in filter(None, remark.split("; ")):
+            methods_of.setdefault(clause, []).append(METHOD_TITLES[task.method])
     remarks = [AGREEMENT_ONLY] if capture.truth_range_m is None else []
-    clauses = {part for each in ESTIMATORS.values() for part in each.remark(capture).split("; ")}
-    remarks += sorted(f"{clause.capitalize()}." for clause in clauses - {""})
-    if n_pictures < n_working:
+    for clause, methods in methods_of.items():
+        named = "" if len(methods) == len(working) else f"{', '.join(methods)}: "
+        sentence = f"{named}{clause}."
+        remarks.append(f"{sentence[0].upper()}{sentence[1:]}")
+    if n_pictures < len(working):
         remarks.append(
-            f"Pictures show the first {n_pictures} methods; plots and table show all {n_working}."
+            f"Pictures show the first {n_pictures} methods; plots and table show all "
+            f"{len(working)}."
         )
     return " ".join(remarks)
