@@ -223,9 +223,11 @@ def _reported_facts(capture: Capture) -> dict[str, Any]:
     """Return how estimates by the likelihood differ from the ranges that the file reports."""
     if capture.reported_range_m is None:
         return {}
-    found = reported_check(capture, estimate(capture, "likelihood"))
+    method = "likelihood"
+    found = reported_check(capture, estimate(capture, method))
     assert found is not None
     return {
+        "reported_range_compared_with": method,
         "reported_range_pixels_compared": found.n_pixels,
         "reported_range_median_difference_m": found.median_m,
         "reported_range_difference_spread_m": found.spread_m,

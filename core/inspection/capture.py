@@ -14,7 +14,7 @@ from core.inference.background import shape_text
 from core.inference.faults import outlier_pixels
 from core.inference.flux import flux_prior_of
 from core.inference.posterior import TOLERANCE_BINS
-from core.inspection.echoes import FEWEST, echoes_of
+from core.inspection.echoes import CONFIDENT, FEWEST, echoes_of
 from core.inspection.mean_flux import METHOD, MeanFlux, mean_flux_of
 from core.inspection.pixel import flux_unit, lag_bins
 from core.inspection.profile import FluxEstimate, OldFluxNames
@@ -151,6 +151,8 @@ def aggregate(capture: Capture) -> NDArray[np.int64]:
 
 
 _MARGIN_BINS = 3 * START_BINS
+_SURE = f"estimates of the likelihood with a confidence of {CONFIDENT:g} or more"
+"""Names the method: the estimates on screen may be those of another one."""
 
 
 @cached_per_capture
@@ -158,14 +160,14 @@ def suggestion(capture: Capture) -> Suggestion:
     """Suggest gate and T_n, with a reason in a sentence each."""
     n_bins, echoes = capture.acquisition.n_bins, echoes_of(capture)
     if echoes is None:
-        why = f"Fewer than {FEWEST} estimates are confident: the delays of echoes are unknown."
+        why = f"Fewer than {FEWEST} {_SURE}: the delays of echoes are unknown."
         t_n = min(_MARGIN_BINS, n_bins - 1)
         return Suggestion((0, n_bins), why, t_n, f"The differentiators need {t_n} bins to settle.")
     lag = lag_bins(capture, "tracking", TrackingParameters())
     echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
     ends = f"{echoes.first:.0f}", f"{echoes.last:.0f}"
     bins = f"bin {ends[0]}" if ends[0] == ends[1] else f"bins {ends[0]} to {ends[1]}"
-    where = f"The {echoes.n_found:,} confident estimates lie in {bins}"
+    where = f"The {echoes.n_found:,} {_SURE} lie in {bins}"
     end = min(math.ceil(echoes.last) + tap + echo.size + _MARGIN_BINS, n_bins)
     if capture.gated_pulses is not None:
         # A cut in front loses pulses, a different number in each pixel.
@@ -181,5 +183,5 @@ def suggestion(capture: Capture) -> Suggestion:
         (first, end),
         why,
         t_n,
-        f"Peaks more than {TOLERANCE_BINS} bins before the confident estimates are noise.",
+        f"Peaks more than {TOLERANCE_BINS} bins before the {_SURE} are noise.",
     )

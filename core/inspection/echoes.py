@@ -35,7 +35,7 @@ _WINDOWS = 10  # of the gate, of which the darkest bounds the background
 
 
 class Echoes(NamedTuple):
-    """Delays of confident estimates, in bins."""
+    """Delays of confident estimates of the likelihood, in bins."""
 
     first: float
     last: float

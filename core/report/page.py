@@ -132,7 +132,7 @@ def page_of(
         *_all_pixels(capture, capture_found, has_t_n),
         *_pixel(capture, image, made_by, pixel_found),
         *cloud,
-        *_reported(capture, image),
+        *_reported(capture, image, made_by),
         *_accuracy(capture, image),
         *_settings(made_by, least_confidence),
         *_script(script),
@@ -419,7 +419,7 @@ def _cloud(
     yield "<noscript><p>The cloud needs JavaScript.</p></noscript>"
 
 
-def _reported(capture: Capture, image: RangeImage) -> Iterator[str]:
+def _reported(capture: Capture, image: RangeImage, made_by: Provenance) -> Iterator[str]:
     found = reported_check(capture, image)
     if found is None:
         return
@@ -429,8 +429,8 @@ def _reported(capture: Capture, image: RangeImage) -> Iterator[str]:
     ]
     yield _heading_2("Distances reported by the sensor")
     yield _paragraph(
-        f"Estimate minus reported distance, in the {found.n_pixels:,} pixels that have both and a "
-        f"confidence of {CONFIDENT:g} or more."
+        f"Estimate by {ESTIMATORS[made_by.method].title} minus reported distance, in the "
+        f"{found.n_pixels:,} pixels that have both and a confidence of {CONFIDENT:g} or more."
     )
     yield _facts(rows)
 

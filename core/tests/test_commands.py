@@ -109,6 +109,7 @@ def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[st
     path = tmp_path / "stairs.npz"
     save_capture(capture, path)
     found = facts(capsys, "info", path)
+    assert found["reported_range_compared_with"] == "likelihood"
     assert found["reported_range_pixels_compared"] == 1
     assert found["reported_range_median_difference_m"] == pytest.approx(1.0, abs=0.1)
     assert found["reported_range_difference_spread_m"] == 0

@@ -790,7 +790,10 @@ def test_a_gate_is_cut_in_front_only_without_loss_of_pulses() -> None:
     assert 90 + 8 < first.gate[1] == photons.gate[1] < 200
     assert photons.gate[0] < photons.t_n
     assert first.t_n == photons.t_n <= 92
-    assert "64 confident estimates lie in bin 90;" in first.why_gate
+    assert (
+        "64 estimates of the likelihood with a confidence of 0.9 or more lie in bin 90;"
+        in first.why_gate
+    )
 
 
 # -- fewer pulses ----------------------------------------------------------------------------------

@@ -526,7 +526,10 @@ def _reported_check_facts(answer: Answer) -> list[Fact]:
     low_m, high_m = found.median_m - found.spread_m, found.median_m + found.spread_m
     decimals = Interval(found.median_m, low_m, high_m).decimals
     median = number(found.median_m, "m", sign=True, decimals=decimals)
-    of_pixels = f"over the {found.n_pixels:,} pixels confident by {CONFIDENT:g} that have both."
+    of_pixels = (
+        f"over the {found.n_pixels:,} pixels with both, of which the estimate by "
+        f"{method_title(answer.method)} has a confidence of {CONFIDENT:g} or more."
+    )
     help = f"Estimate minus the distance that the sensor found, median {of_pixels}"
     spread = f"Half the central 68 % range of this difference {of_pixels}"
     return [
@@ -556,5 +559,8 @@ def accuracy_titles(capture: Capture) -> tuple[str, str, str]:
     across = "Share of the pulses" if capture.acquisition.n_pulses is None else "Pulses"
     if capture.truth_range_m is not None:
         return "Accuracy against number of pulses", across, "Within 3 bins of the truth"
-    title = f"Agreement with all pulses, in pixels confident by {CONFIDENT:g} (not accuracy)"
+    title = (
+        "Agreement with the same method and all pulses, in pixels of which it is confident by "
+        f"{CONFIDENT:g} (not accuracy)"
+    )
     return title, across, "Within 3 bins of it"

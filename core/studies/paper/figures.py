@@ -553,8 +553,8 @@ def agreement(capture: Capture, name: str) -> Table:
         bins,
         {"method": str, **{other: partial(share, other=other) for other in bins}},
         "A measured capture without truth: methods that agree may all be wrong. "
-        f"{np.count_nonzero(is_confident):,} of {is_confident.size:,} pixels, those in which a "
-        f"surface has a confidence of {CONFIDENT:g} or more.",
+        f"{np.count_nonzero(is_confident):,} of {is_confident.size:,} pixels, those in which the "
+        f"likelihood gives a surface a confidence of {CONFIDENT:g} or more.",
     )
 
 
