@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -11,6 +13,7 @@ import pytest
 from bokeh.util.token import generate_jwt_token, generate_session_id
 from playwright.sync_api import expect
 from tornado.httpclient import HTTPClientError
+from tornado.websocket import websocket_connect
 
 from app.server.sessions import Bounds, Sessions
 from tests.browser import eventually, server_process, serving
@@ -194,6 +197,33 @@ def test_a_socket_opens_no_session(empty):
     assert closes(generate_jwt_token(generate_session_id()))
     assert closes("no token at all")
     eventually(lambda: has_room(empty))
+
+
+def test_no_connection_outlives_the_loop_that_opened_it(empty, monkeypatch):
+    connecting = []
+
+    def noted(*arguments, **options):
+        connecting.append(websocket_connect(*arguments, **options))
+        return connecting[-1]
+
+    async def leave():
+        await Wire().open(empty.address)
+
+    async def cancel():
+        cancelled = asyncio.ensure_future(connected(empty.address, token_in(empty.ask()[2])))
+        await asyncio.sleep(0)
+        cancelled.cancel()
+        await asyncio.wait(connecting[-1:])
+        await asyncio.sleep(0)
+
+    monkeypatch.setattr("tests.wire.websocket_connect", noted)
+    for act in (leave, cancel):
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            asyncio.run(act())
+            connecting.clear()
+            gc.collect()
+        assert not [each for each in seen if "WebSocketClient" in str(each.message)]
 
 
 def open_pages(site, count):

@@ -82,6 +82,8 @@ class Wire:
             self._socket.close()
             raise
         self._reading = asyncio.ensure_future(self._read())
+        # At the latest when the loop ends, which cancels this task: nobody need call `close`.
+        self._reading.add_done_callback(lambda _: self._socket.close())
 
     async def _take_over(self) -> None:
         self._socket.protocol.stream.set_nodelay(True)  # as in a browser
@@ -101,7 +103,6 @@ class Wire:
     def close(self) -> None:
         """Disconnect like a closed tab."""
         self._reading.cancel()
-        self._socket.close()
 
     def find(self, kind: str, **attributes: Any) -> str:
         """Id of the first model of a type with these attributes."""
@@ -247,11 +248,18 @@ def token_in(page: str) -> str:
 async def connected(address: str, token: str, **headers: str) -> WebSocketClientConnection:
     """Return the websocket of a session; raise `HTTPClientError` if it is refused."""
     place = address.partition("?")[0].replace("http", "ws", 1)
-    return await websocket_connect(
-        HTTPRequest(f"{place}ws", headers=headers),
-        subprotocols=["bokeh", token],
-        max_message_size=LARGEST_MESSAGE,
+    connecting = asyncio.ensure_future(
+        websocket_connect(
+            HTTPRequest(f"{place}ws", headers=headers),
+            subprotocols=["bokeh", token],
+            max_message_size=LARGEST_MESSAGE,
+        )
     )
+    try:
+        return await asyncio.shield(connecting)
+    except asyncio.CancelledError:  # it connects nevertheless
+        connecting.add_done_callback(lambda done: done.exception() or done.result().close())
+        raise
 
 
 def _objects(content: Any) -> Iterator[Model]:
