@@ -101,6 +101,11 @@ class Acquisition:
         return np.asarray((time_s - self.gate_delay_s) / self.bin_width_s)
 
     @property
+    def gate_length_m(self) -> float:
+        """Length of the gate in range: no error of an estimate within it is larger."""
+        return self.n_bins * self.bin_length_m
+
+    @property
     def bin_length_m(self) -> float:
         """Range covered by one bin, in metres."""
         return float(self.bin_width_s * SPEED_OF_LIGHT_M_S / 2)

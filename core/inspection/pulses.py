@@ -35,8 +35,8 @@ class Accuracy:
     """Share of the pixels with a reference within 3 bins of it, with Wilson's 95 % interval; None
     without any."""
     rmse_m: Interval | None
-    """Root mean square difference from the reference over estimated pixels, with a 95 % interval
-    from the scatter of its squares; None without estimates."""
+    """Root mean square difference from the reference over estimated pixels, with Student's 95 %
+    interval from the scatter of its squares; None without estimates."""
     confidence: float
     """Mean over all pixels, with 0 for pixels without an estimate."""
 
@@ -94,18 +94,19 @@ def _accuracy(
         some.acquisition.n_pulses,
         against,
         metrics.wilson(hits, targets) if targets else None,
-        _root_mean_square(error_m[np.isfinite(error_m)]),
+        _root_mean_square(error_m[np.isfinite(error_m)], some.acquisition.gate_length_m),
         float(image.confidence.mean()),
     )
 
 
-def _root_mean_square(error_m: Floats) -> Interval | None:
+def _root_mean_square(error_m: Floats, gate_m: float) -> Interval | None:
+    """Return the root mean square with Student's interval, from 0 to the length of the gate."""
     if not error_m.size:
         return None
-    squares, mean = error_m**2, float(np.mean(error_m**2))
-    half = 0.0
+    squares, half = error_m**2, math.inf  # one error shows no scatter
+    mean = float(np.mean(squares))
     if squares.size > 1:
-        z = float(scipy.special.ndtri(0.975))
-        half = z * float(np.std(squares, ddof=1)) / math.sqrt(squares.size)
-    low, high = math.sqrt(max(mean - half, 0.0)), math.sqrt(mean + half)
-    return Interval(math.sqrt(mean), low, high)
+        quantile = float(scipy.special.stdtrit(squares.size - 1, 0.975))
+        half = quantile * float(np.std(squares, ddof=1)) / math.sqrt(squares.size)
+    low, high = max(mean - half, 0.0), min(mean + half, max(mean, gate_m**2))
+    return Interval(*map(math.sqrt, (mean, low, high)))

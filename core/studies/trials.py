@@ -19,7 +19,7 @@ import numpy as np
 
 import core
 from core import metrics
-from core.acquisition import Floats, Flux
+from core.acquisition import Acquisition, Floats, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS
 from core.inference.flux import flux_model_of
@@ -102,6 +102,8 @@ class Score:
     inlier_square_m2: float
     """Over errors within 3 bins."""
     seconds: float
+    gate_m: float
+    """Length of the gate, the largest possible error."""
 
 
 def score(capture: Capture, method: Method) -> Score:
@@ -112,15 +114,16 @@ def score(capture: Capture, method: Method) -> Score:
     seconds = perf_counter() - started
     acquisition, truth_m = capture.acquisition, np.asarray(capture.truth_range_m)
     ranges_m = acquisition.bin_to_range_m(bins)[np.newaxis], truth_m[np.newaxis]
-    return compare(*ranges_m, acquisition.bin_length_m, seconds)
+    return compare(*ranges_m, acquisition, seconds)
 
 
-def compare(range_m: Floats, truth_m: Floats, bin_m: float, seconds: float) -> Score:
+def compare(range_m: Floats, truth_m: Floats, acquisition: Acquisition, seconds: float) -> Score:
     """Score estimates (return, ...) against the truth (surface, ...).
 
     Where a pixel has several of either, targets are surfaces, as `metrics.surfaces_found` counts
     them, and errors those of the nearest return.
     """
+    bin_m = acquisition.bin_length_m
     within = [metrics.surfaces_found(range_m, truth_m, t * bin_m) for t in TOLERANCES_BINS]
     error = metrics.surface_errors_m(range_m, truth_m)
     error = error[np.isfinite(error)]
@@ -134,6 +137,7 @@ def compare(range_m: Floats, truth_m: Floats, bin_m: float, seconds: float) -> S
         float((error**2).sum()),
         float((inlier**2).sum()),
         seconds,
+        acquisition.gate_length_m,
     )
 
 
@@ -144,7 +148,8 @@ class Summary:
     rd: tuple[Interval, ...]
     """Restoration degree within each of `TOLERANCES_BINS`, with Wilson intervals."""
     rmse_m: Interval
-    """With Student's interval of the logarithm of the mean square over captures: never below 0."""
+    """With Student's interval of the logarithm of the mean square over captures, which is never
+    below 0, cut to the length of the gate."""
     mae_m: float
     bias_m: float
     inlier_rmse_m: float
@@ -167,10 +172,11 @@ def summary(scores: Sequence[Score]) -> Summary:
     squares = [s.square_m2 / s.answered if s.answered else np.nan for s in scores]
     mean_square = mean_interval(np.array(squares))
     rmse_m = math.sqrt(mean_square.value)
+    most_m = max(s.gate_m for s in scores)
     ratio = math.exp((mean_square.high / mean_square.value - 1) / 2) if rmse_m else 1.0
     return Summary(
         rd=tuple(metrics.wilson(int(h), targets) for h in hits.sum(axis=0)),
-        rmse_m=Interval(rmse_m, rmse_m / ratio, rmse_m * ratio),
+        rmse_m=Interval(rmse_m, rmse_m / ratio, min(rmse_m * ratio, max(rmse_m, most_m))),
         mae_m=mean("absolute_m", answered),
         bias_m=mean("signed_m", answered),
         inlier_rmse_m=math.sqrt(mean("inlier_square_m2", int(hits[:, -1].sum()))),

@@ -89,7 +89,9 @@ def test_a_score_agrees_with_the_metrics() -> None:
 
 
 def a_score(hits: int, square_m2: float, targets: int = 100) -> Score:
-    return Score((hits - 2, hits - 1, hits), targets, targets, 5.0, -2.0, square_m2, 0.5, 0.01)
+    return Score(
+        (hits - 2, hits - 1, hits), targets, targets, 5.0, -2.0, square_m2, 0.5, 0.01, 15.0
+    )
 
 
 def test_a_summary_pools_captures() -> None:
@@ -106,6 +108,13 @@ def test_a_summary_pools_captures() -> None:
     assert found.answered == 1
     assert found.rd_variance == pytest.approx(np.var([0.9, 0.8, 0.85], ddof=1))
     assert found.milliseconds == pytest.approx(10)
+
+
+def test_errors_of_two_captures_are_not_said_to_exceed_the_gate() -> None:
+    few, many = a_score(90, 10.0), a_score(60, 3000.0)
+    found = summary([few, many]).rmse_m
+    assert found.value == pytest.approx(math.sqrt(15.05))
+    assert (0 < found.low < found.value, found.high) == (True, 15.0)
 
 
 @pytest.mark.usefixtures("small_scenes")

@@ -820,3 +820,7 @@ def test_accuracy_over_pulses_is_held_against_the_truth_or_all_pulses() -> None:
     assert next(steps).share == 0.5  # one at a time
     with pytest.raises(ValueError, match="share = 0"):
         inspection.accuracy_over_pulses(capture, [0.5, 0])
+    (alone,) = inspection.accuracy_over_pulses(
+        simulate(random_depths(1), ACQUISITION, Flux(0.3, 0.2), seed=8), [1.0]
+    )
+    assert (alone.rmse_m.low, alone.rmse_m.high) == (0.0, ACQUISITION.gate_length_m)

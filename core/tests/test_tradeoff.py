@@ -65,7 +65,7 @@ def a_point(
     hits: Sequence[int], milliseconds: Sequence[float], name: str = "peak", source: str = "x"
 ) -> Point:
     scores = tuple(
-        Score((0, 0, n), TARGETS, TARGETS, 1.0, 0.0, 1.0, 0.1, 0.001) for n in hits
+        Score((0, 0, n), TARGETS, TARGETS, 1.0, 0.0, 1.0, 0.1, 0.001, 15.0) for n in hits
     )  # fmt: skip
     seconds = tuple(1e-3 * each for each in milliseconds)
     flux_s = (0.01,) * len(seconds)
@@ -276,9 +276,9 @@ def test_a_study_measures_every_applicable_candidate(
     reduction = Reduction(known["merge"], tuple(known["gate"]), known["skip"], known["pool"])
     capture = stairs.capture(6)
     image = estimators.estimate(reduction.of(capture), known["method"], **known["parameters"])
-    truth_m, bin_m = np.asarray(capture.truth_range_m), capture.acquisition.bin_length_m
+    truth_m = np.asarray(capture.truth_range_m)
     found_m = reduction.spread(image.range_m, capture.shape)
-    again = trials.compare(found_m[np.newaxis], truth_m[np.newaxis], bin_m, 0.0)
+    again = trials.compare(found_m[np.newaxis], truth_m[np.newaxis], capture.acquisition, 0.0)
     assert replace(points[2].scores[1], seconds=0.0) == again
 
 

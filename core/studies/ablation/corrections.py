@@ -75,9 +75,15 @@ def score(range_m: Floats, truth_m: Floats, capture: Capture) -> tuple[float, fl
     )
 
 
-def changes(with_it: Floats, without_it: Floats) -> tuple[Interval, Interval]:
-    """Return the mean changes of restoration degree and RMSE, from paired scores (n, 2)."""
-    rd, rmse_m = (mean_interval(each[np.isfinite(each)]) for each in (with_it - without_it).T)
+def changes(with_it: Floats, without_it: Floats, gate_m: float) -> tuple[Interval, Interval]:
+    """Return the mean changes of restoration degree and RMSE, from paired scores (n, 2).
+
+    Neither interval exceeds what is possible in a gate of this length.
+    """
+    rd, rmse_m = (
+        mean_interval(each[np.isfinite(each)], -most, most)
+        for each, most in zip((with_it - without_it).T, (1.0, gate_m), strict=True)
+    )
     return rd, rmse_m
 
 
@@ -87,11 +93,11 @@ def changes_over_rows(
     """Return the changes for estimates (return, row, col), paired over the rows of a truth."""
     truth_m = np.asarray(capture.truth_range_m)
     rows = np.flatnonzero(np.isfinite(truth_m).any(axis=1))
-    scores = (
+    with_it, without_it = (
         np.array([score(range_m[:, row], truth_m[np.newaxis, row], capture) for row in rows])
         for range_m in (with_m, without_m)
     )
-    return changes(*scores)
+    return changes(with_it, without_it, capture.acquisition.gate_length_m)
 
 
 def ranging_ratio(with_it: Capture, without_it: Capture, method: str) -> Interval:

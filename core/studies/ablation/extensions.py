@@ -99,9 +99,9 @@ def judged_on_scene(
     method : str
         Method whose second return is judged.
     """
-    scores, seconds, bin_length_m = [], [], math.nan
+    scores, seconds, bin_length_m, gate_m = [], [], math.nan, math.nan
     for capture in captures:
-        bin_length_m = capture.acquisition.bin_length_m
+        bin_length_m, gate_m = capture.acquisition.bin_length_m, capture.acquisition.gate_length_m
         for ranging in rangings(extension, method):
             fresh = copy.copy(capture)  # without cached results
             started = perf_counter()
@@ -113,7 +113,7 @@ def judged_on_scene(
     return improved(
         extension,
         bin_length_m,
-        *corrections.changes(paired[:, 0], paired[:, 1]),
+        *corrections.changes(paired[:, 0], paired[:, 1], gate_m),
         median_interval(ratio) if len(ratio) >= MIN_REPEATS else UNKNOWN,
     )
 

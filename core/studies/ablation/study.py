@@ -142,7 +142,7 @@ def _part(study: _Study, part: str) -> Requirement:
         part,
         study.difference(other),
         study.acquisition.bin_length_m,
-        *corrections.changes(study.scores, other.scores),
+        *corrections.changes(study.scores, other.scores, study.acquisition.gate_length_m),
         time_ratio(partial(study.capture, 0), partial(other.capture, 0)),
     )
 
@@ -161,7 +161,9 @@ def _correction(study: _Study, correction: str) -> Requirement:
         correction,
         found,
         study.acquisition.bin_length_m,
-        *corrections.changes(study.scored(corrected), study.scored(uncorrected)),
+        *corrections.changes(
+            study.scored(corrected), study.scored(uncorrected), study.acquisition.gate_length_m
+        ),
         corrections.ranging_ratio(corrected[0], uncorrected[0], study.method),
     )
 

@@ -462,7 +462,7 @@ class Piece(NamedTuple):
 def scored(piece: Piece) -> list[list[Score]]:
     """Score each candidate on one capture: once, or once per part of a measured one."""
     capture, source = _capture(piece.source, piece.seed), piece.source
-    bin_m = capture.acquisition.bin_length_m
+    acquisition = capture.acquisition
     if isinstance(source, Simulation):
         truth_m, parts = source.scene.surfaces_m, 1
     else:
@@ -479,7 +479,7 @@ def scored(piece: Piece) -> list[list[Score]]:
         found_m = range_m.reshape(len(range_m), -1)
         scores.append(
             [
-                compare(found_m[:, part], surfaces_m[:, part], bin_m, seconds)
+                compare(found_m[:, part], surfaces_m[:, part], acquisition, seconds)
                 for part in targets
                 if part.size
             ]

@@ -244,7 +244,9 @@ def differences(points: Sequence[Point]) -> Table:
                     one.restored[n - 1] / one.targets - other.restored[n - 1] / other.targets
                     for one, other in zip(pair[0].scores, pair[1].scores, strict=True)
                 ]
-            )
+            ),
+            -1.0,
+            1.0,
         )
 
     return table(
