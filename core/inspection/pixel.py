@@ -18,7 +18,9 @@ from core.checks import require_pixel
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.estimators.base import Evidence
+from core.inference.background import echo_window
 from core.inference.faults import PixelVerdict, pixel_verdict
+from core.inference.fit import Fit, fit_of
 from core.inference.intervals import delay_range_interval, pixel_range_intervals
 from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import (
@@ -101,6 +103,10 @@ class PixelReport(OldFluxNames):
     `flux` states: the estimate if it is one of them, otherwise that of the highest score."""
     find_flux: Callable[[], FluxEstimate] = field(repr=False)
     """Function that estimates `flux`."""
+    find_fit: Callable[[], Fit] = field(repr=False)
+    """Function that returns whether the model describes the capture, or the region."""
+    longest_echo_bins: int = field(repr=False)
+    """Bins after a delay that an echo fills which is similar to the pulse, but longer."""
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
@@ -124,19 +130,36 @@ class PixelReport(OldFluxNames):
         """
         return self.find_flux()
 
-    @property
+    @cached_property
+    def may_be_one_echo(self) -> bool:
+        """Whether several of `surfaces_bin` may be one echo that is longer than the pulse.
+
+        If they are as close as the parts of such an echo, and the echoes of the capture or region
+        have another shape than the pulse (`Fit.pulse`), which is tested on first access.
+        """
+        gaps_bins = np.diff(np.sort(self.surfaces_bin))
+        if not (gaps_bins < self.longest_echo_bins).any():
+            return False
+        fit = self.find_fit()
+        return fit.pulse in fit.failed
+
+    @cached_property
     def surfaces_text(self) -> str:
         """Surfaces that are likelier than not, where they are and how sure that is, as text.
 
-        Such as ``2 surfaces: 47.31 m (probability 0.99), 49.9 m (probability 0.95)``.
+        Such as ``2 surfaces: 47.31 m (probability 0.99), 49.9 m (probability 0.95)``. Without
+        probabilities where the surfaces `may_be_one_echo`: these assume the pulse.
         """
         likely = [each for each in self.candidates if each.probability >= LIKELY]
         places = []
         for each in sorted(likely, key=lambda each: each.range_m):
             interval = Interval(each.range_m, each.range_low_m, each.range_high_m)
             digits = 3 if interval.decimals is None else interval.decimals
-            places.append(f"{each.range_m:.{digits}f} m (probability {each.probability:.2f})")
+            how_sure = "" if self.may_be_one_echo else f" (probability {each.probability:.2f})"
+            places.append(f"{each.range_m:.{digits}f} m{how_sure}")
         noun = "surface" if len(places) == 1 else "surfaces"
+        if self.may_be_one_echo:
+            noun += ", or an echo longer than the pulse"
         return f"{len(places) or 'no'} {noun}" + (f": {', '.join(places)}" if places else "")
 
     @property
@@ -212,6 +235,8 @@ def pixel_report(
         candidates=candidates,
         surfaces_bin=surfaces_bin,
         find_flux=partial(pixel_flux, capture, row, col, surfaces_bin),
+        find_fit=partial(fit_of, capture),
+        longest_echo_bins=echo_window(capture)[1],
         flux_unit=flux_unit(capture),
         flux_method=METHOD if len(surfaces_bin) < 2 else f"{METHOD}; {SEVERAL}",
         verdict=pixel_verdict(capture, row, col),

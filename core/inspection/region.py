@@ -83,6 +83,12 @@ def region_report(
     mean_flux = mean_flux_of(own)
     fitted = replace(summed, pulse=mean_flux.pulse)
     pixel = pixel_report(summed, of_sum, 0, 0, method, settings)
+    fit = fit_in(capture, np.flatnonzero(mask))
+    pixel = replace(
+        pixel,
+        find_flux=partial(pixel_flux, fitted, 0, 0, pixel.surfaces_bin),
+        find_fit=lambda: fit,
+    )
     range_m = image.range_m[mask & image.valid]
     low_m, median_m, high_m = (
         np.quantile(range_m, [0.16, 0.5, 0.84]) if range_m.size else np.full(3, np.nan)
@@ -91,7 +97,7 @@ def region_report(
         n_pixels=n_pixels,
         summed=summed,
         image=of_sum,
-        pixel=replace(pixel, find_flux=partial(pixel_flux, fitted, 0, 0, pixel.surfaces_bin)),
+        pixel=pixel,
         share_answered=range_m.size / n_pixels,
         median_m=float(median_m),
         spread_m=float(high_m - low_m) / 2,
@@ -100,7 +106,7 @@ def region_report(
         flux=mean_flux.image,
         flux_unit=flux_unit(own),
         flux_method=METHOD,
-        fit=fit_in(capture, np.flatnonzero(mask)),
+        fit=fit,
     )
 
 

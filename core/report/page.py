@@ -91,6 +91,7 @@ _PROBABILITY = (
     "Probability: that of a surface at the candidate, where a pixel may have several. The map of "
     "confidence assumes one surface, so its value may be lower."
 )
+_ASSUMED = " It assumes the pulse, which the echoes do not have."
 _ERRORS = {
     "rmse_m": ("Root mean square error", "m"),
     "inlier_rmse_m": ("Root mean square error within 3 bins", "m"),
@@ -379,7 +380,9 @@ def _candidates(capture: Capture, report: PixelReport) -> str:
     ]
     columns = ("Candidate", "Bin", "Range", "Score", "Relative score", "Probability")
     table = _table("Candidates: highest peaks of the score", columns, rows)
-    return f'{table}<p class="note">{_PROBABILITY}</p>'
+    several = f"{report.surfaces_text}. " if len(report.surfaces_bin) > 1 else ""
+    assumed = _ASSUMED if report.may_be_one_echo else ""
+    return f'{table}<p class="note">{_text(several)}{_PROBABILITY}{assumed}</p>'
 
 
 def _cloud(

@@ -443,7 +443,32 @@ def test_a_region_of_two_surfaces_says_so_and_a_slope_does_not() -> None:
         np.testing.assert_allclose(
             found, np.sort(capture.acquisition.range_m_to_bin(middle_m)), atol=1.0
         )
-        assert report.pixel.surfaces_text.startswith("2 surfaces: " if several else "1 surface: ")
+        # The net is as close to the wall as the parts of a longer echo.
+        two = "2 surfaces, or an echo longer than the pulse: "
+        assert report.pixel.surfaces_text.startswith(two if several else "1 surface: ")
+
+
+@pytest.mark.compiled
+def test_an_echo_with_a_tail_is_not_said_to_be_two_surfaces_for_certain() -> None:
+    acquisition = Acquisition(n_bins=120, n_pulses=1000)
+    time_ns = np.arange(0, 50, 0.25)
+    tailed = np.convolve(np.exp(-0.5 * (time_ns - 6) ** 2), np.exp(-time_ns / 12))[: time_ns.size]
+    wall = Scene(np.full((8, 8), acquisition.bin_to_range_m(40.3)), acquisition=acquisition)
+    pulse = Pulse.measured(tailed, 0.25e-9)
+    seen = simulate(wall, acquisition, Flux(0.3, 1.0), pulse=pulse, seed=1)
+    capture = replace(seen, pulse=Pulse.gaussian(1e-9))
+    image = estimate(capture, "likelihood")
+    region = inspection.region_report(capture, image, np.ones((8, 8), bool), "likelihood").pixel
+    pixels = (
+        inspection.pixel_report(capture, image, *each, "likelihood") for each in np.ndindex(8, 8)
+    )
+    pixel = next(each for each in pixels if len(each.surfaces_bin) == 2)
+    for report in (region, pixel):
+        assert report.surfaces_text.startswith("2 surfaces, or an echo longer than the pulse: ")
+        assert "probability" not in report.surfaces_text
+        # No longer echo holds both if they are farther apart.
+        apart = replace(report, longest_echo_bins=1)
+        assert apart.surfaces_text.count("(probability") == 2
 
 
 @pytest.mark.compiled
@@ -807,6 +832,10 @@ def test_accuracy_over_pulses_is_held_against_the_truth_or_all_pulses() -> None:
     assert few.within.value < more.within.value <= every.within.value
     assert every.rmse_m.low < every.rmse_m.value < every.rmse_m.high
     assert every.rmse_m.value < few.rmse_m.value
+    (alone,) = inspection.accuracy_over_pulses(
+        simulate(random_depths(1), ACQUISITION, Flux(0.3, 0.2), seed=8), [1.0]
+    )
+    assert (alone.rmse_m.low, alone.rmse_m.high) == (0.0, ACQUISITION.gate_length_m)
     unknown = replace(capture, truth_range_m=None, acquisition=replace(ACQUISITION, n_pulses=None))
     part, whole = inspection.accuracy_over_pulses(unknown, [0.1, 1.0], "peak")
     assert part.against == "all pulses" and part.n_pulses is None
@@ -820,7 +849,3 @@ def test_accuracy_over_pulses_is_held_against_the_truth_or_all_pulses() -> None:
     assert next(steps).share == 0.5  # one at a time
     with pytest.raises(ValueError, match="share = 0"):
         inspection.accuracy_over_pulses(capture, [0.5, 0])
-    (alone,) = inspection.accuracy_over_pulses(
-        simulate(random_depths(1), ACQUISITION, Flux(0.3, 0.2), seed=8), [1.0]
-    )
-    assert (alone.rmse_m.low, alone.rmse_m.high) == (0.0, ACQUISITION.gate_length_m)

@@ -63,7 +63,7 @@ def inspect_pixel_with_flux(answer: Answer, row: int, col: int) -> Inspected:
     n_bins = answer.capture.acquisition.n_bins
     with spending((1, 1, n_bins), "flux", predicted_flux_time(1, n_bins)):
         found = inspect_pixel(answer, row, col)
-        _ = found.report.flux
+        _ = found.report.flux, found.report.surfaces_text
         return found
 
 

@@ -292,8 +292,10 @@ def _several(report: PixelReport) -> str:
     """Return where the surfaces are if there are several, and what that means for the fluxes."""
     if len(report.surfaces_bin) < 2:
         return ""
-    others = "S is that of one, and B is without the echoes of the others"
-    return f" {report.surfaces_text}. {others}."
+    others = "S is that of one, and B is without the echoes of the others."
+    if report.may_be_one_echo:
+        others += " Probabilities in the table assume the pulse, which the echoes do not have."
+    return f" {report.surfaces_text}. {others}"
 
 
 def fit_explanation(p_value: float) -> str:
