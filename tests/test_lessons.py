@@ -34,6 +34,7 @@ from app.pages.session import Session
 from app.widgets.qr_code import QrCode, qr_image
 from core.parameters import Choice
 from core.studies.lessons import CHECKS, NEED_SIGNAL, VIEWS, Bench, require_signal
+from tests.browser import VIEWS as BOKEH_VIEWS
 from tests.browser import choose, chosen, enter, eventually, field, slider
 from tests.states import link_to
 from tests.threads import HeldLayout, HeldTasks
@@ -522,6 +523,12 @@ def present_the_first_lesson(here: Page) -> None:
     expect(here.get_by_role("button", name="Toggle theme")).to_be_visible()
 
 
+PAINTED = f"""() => {{ {BOKEH_VIEWS}
+  const plots = views.filter((each) => each.model.type === "Figure" && each.bbox.height > 0);
+  return plots.length > 0 && plots.every(({{ frame, bbox }}) => frame.bbox.bottom < bbox.height);
+}}"""
+"""JavaScript: whether plots are painted within their place, the axis below the frame, too."""
+
 LEGENDS_FIT = """all => all.length > 0 && all.every((each) => {
   const { left, right } = each.getBoundingClientRect();
   return 0 <= left && right <= innerWidth;
@@ -615,3 +622,15 @@ def test_lessons_of_every_kind_are_taken_by_keyboard_one_after_another(page, add
     for lesson in others:
         choose(here, "Lesson", numbered(lesson))
         take(here, lesson)
+
+
+@pytest.mark.browser
+def test_the_caption_of_a_slide_is_below_the_axis_on_a_phone(page, address):
+    slides = f"{address}?page=Learn&present=1"
+    here = page(slides, width=390, height=844, ready=".bk-Figure")
+    for place in ("1 / 8", "2 / 8", "3 / 8", "4 / 8"):
+        expect(here.get_by_role("navigation", name="Slides").get_by_role("status")).to_have_text(
+            place
+        )
+        eventually(lambda: here.evaluate(PAINTED))
+        here.keyboard.press("ArrowRight")

@@ -25,6 +25,17 @@
     };
   }
 
+  // A parent measures its plots when it is resized itself; a plot that a text below makes smaller then
+  // takes its size for known, and stays painted in the former one.
+  const plots = Bokeh.Models.get("Figure").prototype.default_view.prototype;
+  const { after_resize: resize } = plots;
+  plots.after_resize = function () {
+    resize.call(this);
+    if (!this.layout || this.bbox.is_empty) return;
+    const { width, height } = this.canvas.bbox;
+    if (width !== this.bbox.width || height !== this.bbox.height) this.invalidate_layout();
+  };
+
   const { _after_resize: layOut } = components;
   components._after_resize = function () {
     if (this.child_views.length > 0) layOut.call(this);
