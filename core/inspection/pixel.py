@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -130,15 +131,24 @@ class PixelReport(OldFluxNames):
         """
         return self.find_flux()
 
+    @property
+    def _likely(self) -> list[RangeCandidate]:
+        """Surfaces that are likelier than not."""
+        return [each for each in self.candidates if each.probability >= LIKELY]
+
     @cached_property
     def may_be_one_echo(self) -> bool:
         """Whether several of `surfaces_bin` may be one echo that is longer than the pulse.
 
-        If they are as close as the parts of such an echo, and the echoes of the capture or region
-        have another shape than the pulse (`Fit.pulse`), which is tested on first access.
+        If one has a lower score than another one shortly before it, as the tail of such an echo,
+        and the echoes of the capture or region have another shape than the pulse (`Fit.pulse`),
+        which is tested on first access.
         """
-        gaps_bins = np.diff(np.sort(self.surfaces_bin))
-        if not (gaps_bins < self.longest_echo_bins).any():
+        in_order = sorted(self._likely, key=lambda each: each.bin)
+        if not any(
+            later.bin - earlier.bin < self.longest_echo_bins and later.score < earlier.score
+            for earlier, later in pairwise(in_order)
+        ):
             return False
         fit = self.find_fit()
         return fit.pulse in fit.failed
@@ -150,8 +160,7 @@ class PixelReport(OldFluxNames):
         Such as ``2 surfaces: 47.31 m (probability 0.99), 49.9 m (probability 0.95)``. Without
         probabilities where the surfaces `may_be_one_echo`: these assume the pulse.
         """
-        likely = [each for each in self.candidates if each.probability >= LIKELY]
-        places = []
+        likely, places = self._likely, []
         for each in sorted(likely, key=lambda each: each.range_m):
             interval = Interval(each.range_m, each.range_low_m, each.range_high_m)
             digits = 3 if interval.decimals is None else interval.decimals
