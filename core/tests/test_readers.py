@@ -229,6 +229,13 @@ def test_own_layout_without_a_pulse_has_the_one_of_its_counts(write: Write) -> N
     assert own.source.partition("; ")[2] == other.source.partition("; ")[2]
 
 
+@pytest.mark.parametrize("name", ["cube", "counts"])
+def test_bin_width_and_pulses_may_have_other_names(name: str, write: Write) -> None:
+    content = npz_bytes(**{name: CUBE}, bin_width_ps=100, shots=500)
+    acquisition = read_capture(write("a.npz", content)).acquisition
+    assert (acquisition.bin_width_s, acquisition.n_pulses) == (1e-10, 500)
+
+
 def test_numbers_of_the_own_layout_accompany_counts_of_another_name(write: Write) -> None:
     known = {"bin_width_s": 2e-9, "gate_delay_s": 1e-7, "n_pulses": 500}
     others = {"background": CUBE[0], "pixel_angle_rad": np.ones((3, 4)), "source": "?"}

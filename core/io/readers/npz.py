@@ -121,14 +121,15 @@ def read(path: Path, request: ReadOptions) -> Capture:
         numbers = [each for each in stating(names) if _is_number(archive, each)]
         stated = stated_flux({each: _field(archive, each) for each in numbers})
         is_frames = name == "frames" or (request.no_trigger is not None and name != "cube")
+        numbers = [each for each in timing(names) if _is_number(archive, each)]
         if name != "cube" and not is_frames:
             counts = _array(archive, name)
             require_counts(counts, name, request.axes)
-            numbers = [each for each in timing(names) if _is_number(archive, each)]
             known = {each: _field(archive, each) for each in numbers}
             capture = cube_capture(counts, name, origin, completed(request, known))
             return with_guesses(replace(capture, stated_flux=stated), variable=name)
-        known = {field: _field(archive, field) for field in names if field in _FIELDS}
+        kept = {*numbers, *_FIELDS}
+        known = {field: _field(archive, field) for field in names if field in kept}
         version = known.get("format", FORMAT)
         require("format", version, str(version) == FORMAT, FORMAT)
         if "gate_delay_s" in known:
