@@ -1,7 +1,7 @@
 """Intervals of the range of a surface, from the photons of its pixel.
 
-Given that a surface lies within `TOLERANCE_BINS` of an estimate, the probability of which is the
-confidence, its delay ``d`` has the posterior density ::
+Given that a surface lies within `interval_tolerance_bins` of an estimate, its delay ``d`` has the
+posterior density ::
 
     p(d) ∝ Σ_l share_l L_l(d)
 
@@ -15,6 +15,11 @@ variance of the delay with unknown fluxes over that with known ones, by the Fish
 interval is about the surface and not about the method: it is the same for all estimates with the
 same window.
 
+Where surfaces move while the pulses are sent, and the image has their velocity and the capture
+groups of its pulses, the likelihood is that of the groups, each at the range that the surface has
+reached at the estimated velocity, with the fluxes at that velocity. Its error hardly matters: the
+range is that in the middle of the recording.
+
 Where the counts near the echo differ from the model by more than chance (another pulse, a second
 surface), the density is raised to the power ``1 / φ``, with the dispersion φ of these counts
 (quasi-likelihood, McCullagh & Nelder 1989): many photons do not make up for a model that is wrong.
@@ -23,7 +28,7 @@ surface), the density is raised to the power ``1 / φ``, with the dispersion φ 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -33,13 +38,18 @@ from core.acquisition import Floats, Pulse
 from core.capture import Capture, cached_per_capture
 from core.checks import require, require_pixel
 from core.inference.flux import LEVEL_SPAN, LEVELS, flux_model_of
+from core.inference.flux_model import FluxModel
+from core.inference.motion import RadialVelocity, flux_at_rest
 from core.inference.posterior import TOLERANCE_BINS
 from core.metrics import Interval
+from core.pulse_groups import PulseGroups
 
 if TYPE_CHECKING:
     from core.estimators import RangeImage
 
-_COARSE_NODES = 8 * TOLERANCE_BINS + 1  # a quarter of a bin apart
+_COARSE_NODES = 25  # a quarter of a bin apart over `TOLERANCE_BINS`
+_HALF_PULSE = 2.0  # standard deviations of a pulse, of which its length is twice as many
+_PHASES = 4  # parts of a bin to which displacements are rounded, evenly to either side
 _NODES = 64  # delays at which the density is evaluated
 _DROP = 12.0  # log density below the maximum, at which a delay is negligible
 _MOST_ZOOMS = 12
@@ -69,11 +79,12 @@ def range_intervals(
 ) -> tuple[RangeInterval, ...]:
     """Compute central posterior intervals of the range of each pixel, together for all levels.
 
-    They are calibrated: of the estimates within `TOLERANCE_BINS` of the surface, a share of each
-    level have an interval that contains the range of the surface. Whether a surface is there is
-    what `RangeImage.confidence` says. Echoes that fire nearly every pulse, of more than about four
-    photons per pulse, hide their flux: their intervals are too narrow. So are those of surfaces
-    that move, since they are computed as if these were at rest.
+    They are calibrated: of the estimates within `interval_tolerance_bins` of the surface, a share
+    of each level have an interval that contains the range of the surface. Whether a surface is
+    there is what `RangeImage.confidence` says. Echoes that fire nearly every pulse, of more than
+    about four photons per pulse, hide their flux: their intervals are too narrow. So are those of
+    surfaces that move, unless the image has their velocity, from the method `velocity`, and this is
+    right: otherwise they are computed as if the surfaces were at rest.
 
     Parameters
     ----------
@@ -93,11 +104,13 @@ def range_intervals(
     tails = _all_tails(levels)
     limits = np.full((tails.size, capture.counts.size), np.nan)
     pixels = np.flatnonzero(image.valid)
-    n_bins = max(_NODES * _n_window_bins(capture), capture.acquisition.n_bins)
+    moved = _moving(capture, image.velocity)
+    n_phases = 1 if moved is None else _PHASES
+    n_bins = max(_NODES * n_phases * _n_window_bins(capture), capture.acquisition.n_bins)
     at_once = max(1, _AT_ONCE // n_bins)
     for first in range(0, pixels.size, at_once):
         some = pixels[first : first + at_once]
-        limits[:, some] = _quantiles_bins(capture, some, image.bin.ravel()[some], tails)
+        limits[:, some] = _quantiles_bins(capture, some, image.bin.ravel()[some], tails, moved)
     limits_m = capture.acquisition.bin_to_range_m(limits.reshape(-1, 2, *shape))
     return tuple(RangeInterval(*each) for each in limits_m)
 
@@ -126,26 +139,34 @@ def pixel_range_intervals(
     tails = _all_tails(levels)
     limits_m = np.full(tails.size, np.nan)
     if image.valid[row, col]:
-        limits = _limits_bins(capture, row, col, float(image.bin[row, col]), tuple(tails))
+        at_bin, moved = float(image.bin[row, col]), _moving(capture, image.velocity)
+        limits = _limits_bins(capture, row, col, at_bin, tuple(tails), moved)
         limits_m = capture.acquisition.bin_to_range_m(limits)
     return tuple(Interval(estimate_m, *each) for each in limits_m.reshape(-1, 2).tolist())
 
 
 @cached_per_capture
 def _limits_bins(
-    capture: Capture, row: int, col: int, estimate_bin: float, shares: tuple[float, ...]
+    capture: Capture,
+    row: int,
+    col: int,
+    estimate_bin: float,
+    shares: tuple[float, ...],
+    moved: RadialVelocity | None,
 ) -> Floats:
     """Quantiles (share,) of the delay of a pixel near an estimate, which few settings move."""
     pixel = np.array([row * capture.shape[1] + col])
-    return _quantiles_bins(capture, pixel, np.array([estimate_bin]), np.array(shares))[:, 0]
+    at_bin = np.array([estimate_bin])
+    return _quantiles_bins(capture, pixel, at_bin, np.array(shares), moved)[:, 0]
 
 
 def delay_range_interval(
-    capture: Capture, row: int, col: int, delay_bins: Floats, level: float = 0.95
+    capture: Capture, image: RangeImage, row: int, col: int, delay_bins: Floats, level: float = 0.95
 ) -> RangeInterval:
     """Return the interval of a surface near each of some delays (delay,) of a pixel, in metres."""
     pixels = np.full(delay_bins.size, row * capture.shape[1] + col)
-    limits = _quantiles_bins(capture, pixels, delay_bins, _all_tails([level]))
+    moved = _moving(capture, image.velocity)
+    limits = _quantiles_bins(capture, pixels, delay_bins, _all_tails([level]), moved)
     return RangeInterval(*capture.acquisition.bin_to_range_m(limits))
 
 
@@ -156,14 +177,47 @@ def _all_tails(levels: Sequence[float]) -> Floats:
     return np.array([tail for level in levels for tail in ((1 - level) / 2, (1 + level) / 2)])
 
 
+def interval_tolerance_bins(capture: Capture) -> int:
+    """Distance from an estimate in bins at which its interval is cut: that of a right estimate.
+
+    It is `TOLERANCE_BINS`, or half the length of a pulse that is longer.
+    """
+    acquisition = capture.acquisition
+    half_pulse = math.ceil(_HALF_PULSE * capture.pulse.sigma_s / acquisition.bin_width_s)
+    return max(TOLERANCE_BINS, min(half_pulse, acquisition.n_bins))
+
+
+def _moving(capture: Capture, velocity: RadialVelocity | None) -> RadialVelocity | None:
+    """Return the velocity of the surfaces if some move and the order of the pulses is known."""
+    if velocity is None or capture.groups is None or not velocity.bins.any():
+        return None
+    return velocity
+
+
+def _travel_bins(groups: PulseGroups, velocity: RadialVelocity) -> Floats:
+    """Displacement of each pixel over the recording, shape (row, col)."""
+    return np.asarray(velocity.bins * (sum(groups.n_pulses) / 1000))
+
+
+@cached_per_capture
+def _flux_of_moving(capture: Capture, velocity: RadialVelocity) -> FluxModel:
+    groups = capture.groups
+    assert groups is not None
+    return flux_at_rest(capture, groups, _travel_bins(groups, velocity))
+
+
 def _quantiles_bins(
-    capture: Capture, pixels: NDArray[np.intp], estimate_bin: Floats, shares: Floats
+    capture: Capture,
+    pixels: NDArray[np.intp],
+    estimate_bin: Floats,
+    shares: Floats,
+    moved: RadialVelocity | None,
 ) -> Floats:
     """Quantiles of the delay of some pixels, given as flat indices, shape (share, pixel)."""
-    n_bins = capture.acquisition.n_bins
-    low = np.clip(estimate_bin - TOLERANCE_BINS, 0.0, n_bins)
-    high = np.clip(estimate_bin + TOLERANCE_BINS, 0.0, n_bins)
-    window = _window(capture, pixels, estimate_bin)
+    n_bins, tolerance_bins = capture.acquisition.n_bins, interval_tolerance_bins(capture)
+    low = np.clip(estimate_bin - tolerance_bins, 0.0, n_bins)
+    high = np.clip(estimate_bin + tolerance_bins, 0.0, n_bins)
+    window = _window(capture, pixels, estimate_bin, moved)
     delay = _nodes(low, high, _COARSE_NODES)
     best = np.argmax(_log_density(window, delay), axis=1)[:, np.newaxis]
     at = np.take_along_axis(delay, best, axis=1)
@@ -195,16 +249,18 @@ def _inverse(mass: Floats, delay: Floats, share: float) -> Floats:
 class _Window(NamedTuple):
     """Counts and fluxes of some pixels in the bins that an echo near their estimates can fill.
 
-    The rest of the gate is added up in one further bin, in which there is no echo, and pulses count
-    by the background that they meet, relative to that of the window.
+    Groups of pulses are displaced to where the surface is in the middle of the recording, by whole
+    bins; those of each phase, the part of a bin that remains, are added up. The rest of the gate is
+    added up in one further bin, in which there is no echo, and pulses count by the background that
+    they meet, relative to that of the window.
     """
 
     pulse: Pulse
     bin_width_s: float
     edges: Floats
-    """Edges of the bins, shape (pixel, bin)."""
+    """Edges of the bins, shape (pixel, phase, edge)."""
     fired: Floats
-    """Counts, shape (pixel, bin); 0 outside the gate."""
+    """Counts, shape (pixel, bin), of one phase after the other; 0 outside the gate."""
     unfired: Floats
     """Pulses that did not fire by the end of the bin, likewise; for all photons 1 a bin."""
     is_first: bool
@@ -232,7 +288,7 @@ class _Window(NamedTuple):
 
 def _n_window_bins(capture: Capture) -> int:
     first, end = _echo_bins(capture)
-    return end - first + 2 * TOLERANCE_BINS + 1
+    return end - first + 2 * interval_tolerance_bins(capture) + 1
 
 
 def _echo_bins(capture: Capture) -> tuple[int, int]:
@@ -242,32 +298,90 @@ def _echo_bins(capture: Capture) -> tuple[int, int]:
     return math.floor(max(first, -n_bins)), math.ceil(min(end, n_bins))
 
 
-def _window(capture: Capture, pixels: NDArray[np.intp], estimate_bin: Floats) -> _Window:
-    flux, n_bins, n_pulses = flux_model_of(capture), capture.cube.shape[2], capture.gated_pulses
-    counts = capture.cube.reshape(-1, n_bins)[pixels].astype(float)
+class _Counted(NamedTuple):
+    """Pulses of some pixels that are counted together."""
+
+    counts: Floats
+    """Shape (pixel, bin)."""
+    unfired: Floats
+    """Likewise, as `_Window.unfired`."""
+    moved_bins: NDArray[np.intp]
+    """Whole bins by which the surface is displaced, shape (pixel,)."""
+    phase: NDArray[np.intp]
+    """Remaining phase, likewise."""
+
+
+def _at_rest(capture: Capture, pixels: NDArray[np.intp]) -> Iterator[_Counted]:
+    """Yield all pulses together."""
+    counts = capture.cube.reshape(-1, capture.cube.shape[2])[pixels].astype(float)
+    n_pulses, none = capture.gated_pulses, np.zeros(pixels.size, np.intp)
     unfired = np.ones_like(counts) if n_pulses is None else n_pulses - np.cumsum(counts, axis=1)
+    yield _Counted(counts, unfired, none, none)
+
+
+def _in_groups(
+    capture: Capture, pixels: NDArray[np.intp], moved: RadialVelocity
+) -> Iterator[_Counted]:
+    """Yield the groups of pulses."""
+    groups = capture.groups
+    assert groups is not None
+    travel_bins = _travel_bins(groups, moved).ravel()[pixels]
+    total = sum(groups.n_pulses)
+    for cube, sent, middle in zip(groups.counts, groups.n_pulses, groups.middle, strict=True):
+        counts = cube.reshape(-1, cube.shape[2])[pixels].astype(float)
+        if capture.gated_pulses is None:
+            unfired = np.full_like(counts, sent / total)
+        else:
+            unfired = sent - np.cumsum(counts, axis=1)
+        steps = np.rint(middle * travel_bins * _PHASES).astype(np.intp)
+        yield _Counted(counts, unfired, *np.divmod(steps, _PHASES))
+
+
+def _window(
+    capture: Capture,
+    pixels: NDArray[np.intp],
+    estimate_bin: Floats,
+    moved: RadialVelocity | None,
+) -> _Window:
+    if moved is None:
+        n_phases, flux, parts = 1, flux_model_of(capture), _at_rest(capture, pixels)
+    else:
+        n_phases, flux = _PHASES, _flux_of_moving(capture, moved)
+        parts = _in_groups(capture, pixels, moved)
+    n_bins = capture.cube.shape[2]
     signal, background = (x.reshape(len(x), -1)[1:, pixels] for x in (flux.signal, flux.background))
-    first = np.floor(estimate_bin).astype(np.intp) - TOLERANCE_BINS + _echo_bins(capture)[0]
-    bins = first[:, np.newaxis] + np.arange(_n_window_bins(capture))
-    inside = (bins >= 0) & (bins < n_bins)
-    some = np.arange(pixels.size)[:, np.newaxis], np.clip(bins, 0, n_bins - 1)
+    first = np.floor(estimate_bin).astype(np.intp) - interval_tolerance_bins(capture)
+    first += _echo_bins(capture)[0]
+    n_window_bins = _n_window_bins(capture) + (n_phases > 1)
+    bins = first[:, np.newaxis] + np.arange(n_window_bins)
     # A window is short: its background is that at the estimate.
     at = np.clip(estimate_bin, 0, n_bins - 1).astype(np.intp)
     here = flux.relative_background[at]
-
-    def in_window(values: Floats, weight: Floats | float) -> Floats:
-        found, beyond = np.where(inside, values[some], 0.0), values * weight
-        rest = beyond.sum(axis=1) - np.where(inside, beyond[some], 0.0).sum(axis=1)
-        return np.concatenate([found, rest[:, np.newaxis]], axis=1)
-
+    weight = flux.relative_background / here[:, np.newaxis]
+    each = np.arange(pixels.size)
+    found = np.zeros((2, pixels.size, n_phases, n_window_bins))
+    rest = np.zeros((2, pixels.size))
+    for part in parts:
+        met = bins + part.moved_bins[:, np.newaxis]
+        inside = (met >= 0) & (met < n_bins)
+        some = each[:, np.newaxis], np.clip(met, 0, n_bins - 1)
+        for i, (values, beyond) in enumerate(
+            ((part.counts, part.counts), (part.unfired, part.unfired * weight))
+        ):
+            found[i, each, part.phase] += np.where(inside, values[some], 0.0)
+            rest[i] += beyond.sum(axis=1) - np.where(inside, beyond[some], 0.0).sum(axis=1)
+    fired, unfired = np.concatenate(
+        [found.reshape(2, pixels.size, -1), rest[..., np.newaxis]], axis=2
+    )
     log_share = np.log(np.maximum(flux.share[1:, np.newaxis], np.finfo(float).tiny))
+    edges = np.concatenate([bins, bins[:, -1:] + 1], axis=1).astype(float)
     return _Window(
         capture.pulse,
         capture.acquisition.bin_width_s,
-        np.concatenate([bins, bins[:, -1:] + 1], axis=1).astype(float),
-        in_window(counts, 1.0),
-        in_window(unfired, flux.relative_background / here[:, np.newaxis]),
-        n_pulses is not None,
+        edges[:, np.newaxis] - np.arange(n_phases)[:, np.newaxis] / n_phases,
+        fired,
+        unfired,
+        capture.gated_pulses is not None,
         signal,
         background / n_bins * here,
         np.broadcast_to(log_share, signal.shape),
@@ -277,9 +391,10 @@ def _window(capture: Capture, pixels: NDArray[np.intp], estimate_bin: Floats) ->
 
 def _share(window: _Window, delay: Floats) -> Floats:
     """Share of an echo's photons in each bin (pixel, node, bin), at delays (pixel, node)."""
-    until = (window.edges[:, np.newaxis] - delay[..., np.newaxis]) * window.bin_width_s
+    until = window.edges[:, np.newaxis] - delay[..., np.newaxis, np.newaxis]
+    until *= window.bin_width_s
     share = np.zeros((*delay.shape, window.fired.shape[1]))
-    share[..., :-1] = np.diff(window.pulse.cdf(until), axis=2)
+    share[..., :-1] = np.diff(window.pulse.cdf(until), axis=3).reshape(*delay.shape, -1)
     return share
 
 
@@ -374,8 +489,9 @@ def _flux_widening(window: _Window, delay: Floats, share: Floats) -> Floats:
     Where an echo fires nearly every pulse, a brighter one looks like an earlier one.
     """
     density = np.zeros_like(window.fired)
-    until_s = (window.edges - delay) * window.bin_width_s
-    density[:, :-1] = -np.diff(window.pulse.density(until_s), axis=1) * window.bin_width_s
+    until_s = (window.edges - delay[..., np.newaxis]) * window.bin_width_s
+    share_per_s = -np.diff(window.pulse.density(until_s), axis=2)
+    density[:, :-1] = share_per_s.reshape(len(delay), -1) * window.bin_width_s
     level = np.argmax(_log_levels(window, share), axis=0).T
     signal, background = (
         np.take_along_axis(each, level, axis=0)[0] for each in (window.signal, window.background)

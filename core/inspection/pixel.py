@@ -53,7 +53,8 @@ class RangeCandidate:
     the candidate that is the estimate."""
     range_m: float
     range_low_m: float
-    """Lower limit of the 95 % interval of the range, if there is a surface within 3 bins."""
+    """Lower limit of the 95 % interval of the range, if there is a surface within 3 bins, or within
+    half the length of a longer pulse."""
     range_high_m: float
     """Upper limit, likewise."""
     score: float
@@ -345,7 +346,7 @@ def _candidates(
     elif is_estimate.any():
         confidence = float(probability[is_estimate][0])
     range_m = capture.acquisition.bin_to_range_m(bins)
-    interval_m = delay_range_interval(capture, row, col, bins)
+    interval_m = delay_range_interval(capture, image, row, col, bins)
     relative = (score - base) / (score[0] - base)
     columns = (bins, range_m, *interval_m, score, relative, probability)
     found = tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
