@@ -59,7 +59,8 @@ _FLUX_S, _MIXTURE_S = 20e-6, 5e-6  # per bin of a pixel
 _FIT_S, _FIT_BYTES = 0.5e-6, 80_000_000  # per bin of a pixel; of the pixels tested at once
 _INTERVAL_S, _INTERVAL_BYTES = 6e-6, 50_000_000  # per bin near an estimate; of pixels at once
 _RETURN_S, _RETURN_BYTES, _RETURN_DRAWN = 2e-6, 16.0, 2**13  # per bin of a pixel; those drawn
-_MOVING_S = 1.2e-9  # per velocity, count, and group of pulses or tap
+_MOVING_S = 2e-9  # per velocity, count, and group of pulses or tap
+_MOVING_INTERVALS = 8.0  # time of intervals of moving surfaces over that of others
 _WINDOW_ECHOES = 4  # width of nearly all of an echo, in `Capture.echo_bins`
 _ECHOES = 64  # noise-free echoes of the lag calibration
 _USUAL_LEVELS = 4  # signal levels of a capture
@@ -209,7 +210,7 @@ def predicted_fit_time(n_pixels: int, n_bins: int) -> Cost:
     return Cost(_FIT_BYTES, _FIT_S * n_pixels * n_bins)
 
 
-def predicted_interval_time(n_pixels: int, echo_bins: int) -> Cost:
+def predicted_interval_time(n_pixels: int, echo_bins: int, is_moving: bool = False) -> Cost:
     """Predict memory and time of range intervals (`core.range_intervals`) of pixels.
 
     Parameters
@@ -218,9 +219,12 @@ def predicted_interval_time(n_pixels: int, echo_bins: int) -> Cost:
         Pixels with an estimate.
     echo_bins : int
         Bins that an echo fills (`Capture.echo_bins`).
+    is_moving : bool
+        Whether the image has velocities of the surfaces.
     """
-    n_bins = _WINDOW_ECHOES * echo_bins + 2 * TOLERANCE_BINS + 1
-    return Cost(_INTERVAL_BYTES, _INTERVAL_S * n_bins * n_pixels)
+    n_bins = _WINDOW_ECHOES * echo_bins + 2 * max(TOLERANCE_BINS, echo_bins) + 1
+    factor = _MOVING_INTERVALS if is_moving else 1.0
+    return Cost(_INTERVAL_BYTES, factor * _INTERVAL_S * n_bins * n_pixels)
 
 
 def predicted_returns_time(n_pixels: int, n_bins: int) -> Cost:

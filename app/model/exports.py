@@ -209,7 +209,8 @@ def image_files(
 def _with_intervals(answer: Answer, product: Product) -> Product:
     """Add the intervals of the ranges, or the remark that they would take too long."""
     n_pixels = int(product.image.valid.sum())
-    if fits(predicted_interval_time(n_pixels, answer.capture.echo_bins)):
+    is_moving = product.image.velocity is not None
+    if fits(predicted_interval_time(n_pixels, answer.capture.echo_bins, is_moving)):
         inner, outer = range_intervals(answer.capture, product.image, (0.68, 0.95))
         return replace(product, interval_68=inner, interval=outer)
     return replace(product, remark="; ".join(filter(None, (product.remark, NO_INTERVALS))))

@@ -114,7 +114,11 @@ def _velocity(capture: Capture, parameters: VelocityParameters) -> RadialVelocit
 
 def _omits(capture: Capture) -> str:
     at_rest = "surfaces are taken to be at rest: the capture keeps no groups of pulses in order"
-    clauses = (LIKELIHOOD.omits(capture), "" if capture.groups else at_rest)
+    alike = (
+        "intervals of velocities are too narrow where these differ from pixel to pixel by less "
+        "than the photons show"
+    )
+    clauses = (LIKELIHOOD.omits(capture), alike if capture.groups else at_rest)
     return "; ".join(filter(None, clauses))
 
 

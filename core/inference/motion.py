@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from core.acquisition import Floats
 from core.capture import Capture
@@ -36,7 +37,16 @@ STEPS_PER_BIN = 4
 displacements would make velocities of a whole step per group less likely than others."""
 
 _SIGMAS = 1.96  # of a 95 % interval
-_AT_REST = 0.5  # prior probability of a velocity of 0
+_LEVEL = 0.95
+_BISECTIONS = 40
+_LEAST_CURVATURE = 1e-9
+_TRIED_PER_BIN = 2  # delays whose mean is the evidence; one would depend on where in a bin they lie
+_SINGLE, _PIXELS_KNOWN = (
+    0.01,
+    50.0,
+)  # prior share of pixels with a velocity of their own, its weight
+_SHARE_STEPS = 10
+_CLEAR_DEVIATIONS = 2.0  # of the spread of the velocities of a neighbourhood, beyond chance
 _FINE = 4  # velocities per bin for which delays are found
 
 
@@ -49,7 +59,9 @@ class RadialVelocity:
     bins : ndarray, shape (row, col)
         Velocity in bins per 1000 pulses.
     sd_bins : ndarray, shape (row, col)
-        Standard deviation of its error, infinite where it is not known.
+        Standard deviation of its error, infinite where it is not known: half the width of the 95 %
+        interval over 1.96. It allows for velocities that differ from pixel to pixel where the
+        photons show this; smaller differences are not seen, and then intervals are too narrow.
     m_per_s : float, optional
         Metres per second of a bin per 1000 pulses; None where the pulse rate is not known.
     """
@@ -109,7 +121,7 @@ class Velocity(NamedTuple):
     travel_bins: Floats
     """Displacement over the whole recording in bins, positive if the surface recedes."""
     sd_bins: Floats
-    """Standard deviation of its error; infinite at the end of the velocities tried."""
+    """As `RadialVelocity.sd_bins`; infinite at the end of the velocities tried."""
 
     def of(self, capture: Capture, groups: PulseGroups) -> RadialVelocity:
         """Return the velocities per 1000 pulses of a capture."""
@@ -131,7 +143,11 @@ class MovingSurfaces(NamedTuple):
 
 
 def velocity_evidence(
-    capture: Capture, groups: PulseGroups, flux: FluxModel, travel_bins: NDArray[np.intp]
+    capture: Capture,
+    groups: PulseGroups,
+    flux: FluxModel,
+    travel_bins: NDArray[np.intp],
+    tried_per_bin: int = _TRIED_PER_BIN,
 ) -> Floats:
     """Log likelihood ratio of each velocity to no echo, shape (row, col, velocity).
 
@@ -143,13 +159,15 @@ def velocity_evidence(
     flux : FluxModel
     travel_bins : ndarray of int, shape (velocity,)
         Displacements over the recording.
+    tried_per_bin : int
+        Delays tried in each bin, up to `STEPS_PER_BIN`.
     """
     evidence = np.empty((capture.counts.size, travel_bins.size))
     displaced = _displacements(travel_bins, groups)
     for pixels, prepared, counts in _parts(capture, groups, flux):
         lanes = counts.shape[3]
         found = np.empty((travel_bins.size, counts.shape[1], lanes))
-        given = prepared, counts, _exposure(capture, groups), displaced, found
+        given = prepared, counts, _exposure(capture, groups), displaced, tried_per_bin, found
         on_threads(fill_velocity_evidence, counts.shape[1], counts.size * travel_bins.size, *given)
         evidence[pixels] = found.reshape(travel_bins.size, -1).T[: pixels.stop - pixels.start]
     return evidence.reshape(*capture.shape, travel_bins.size)
@@ -166,7 +184,7 @@ def shared_velocity(
     """Find the velocity of each pixel by the evidence of the pixels around it.
 
     Half of the prior is rest, the other half spread evenly over the velocities: a scene at rest is
-    not ranged with velocities of chance.
+    not ranged with velocities of chance. Intervals are those without this preference.
 
     Parameters
     ----------
@@ -183,22 +201,137 @@ def shared_velocity(
     """
     at_rest = most_bins // step_bins
     travel_bins = np.arange(-at_rest, at_rest + 1) * step_bins
-    alone = velocity_evidence(capture, groups, flux, travel_bins)
+    tried_per_bin = max(1, _TRIED_PER_BIN // step_bins)
+    alone = velocity_evidence(capture, groups, flux, travel_bins, tried_per_bin)
     evidence = box_sum(alone, window_size, "constant")
-    prior = np.full(travel_bins.size, (1 - _AT_REST) / max(2 * at_rest, 1))
-    prior[at_rest] = _AT_REST
-    best = (evidence + np.log(prior)).argmax(axis=2)
-    around = np.clip(best + np.arange(-1, 2)[:, np.newaxis, np.newaxis], 0, travel_bins.size - 1)
-    before, at, after = np.take_along_axis(evidence, np.moveaxis(around, 0, 2), axis=2).transpose(
-        2, 0, 1
-    )
-    curvature = np.maximum(2 * at - before - after, 1e-9)
+    best = evidence.argmax(axis=2)
+    at, slope, curvature = _parabola(evidence, best)
     inside = (best > 0) & (best < travel_bins.size - 1)
-    shift = np.where(inside, np.clip((after - before) / (2 * curvature), -0.5, 0.5), 0.0)
-    return Velocity(
-        np.where(best == at_rest, 0.0, travel_bins[best] + step_bins * shift),
-        np.where(inside, step_bins / np.sqrt(curvature), np.inf),
-    )
+    curvature = np.maximum(curvature, _LEAST_CURVATURE)
+    steps = np.where(inside, np.clip(slope / curvature, -0.5, 0.5), 0.0)
+    sd_steps = 1 / np.sqrt(curvature)
+    peak = at + slope * steps - curvature * steps**2 / 2
+    # Share of the prior of a displacement by a step that lies in the peak.
+    width = np.log(np.minimum(math.sqrt(2 * math.pi) * sd_steps, 1.0))
+    odds = math.log(max(2 * at_rest, 1))  # of rest and of another velocity
+    is_at_rest = evidence[:, :, at_rest] + odds >= peak + width
+    found = np.where(is_at_rest, at_rest, best + steps)
+    spread = _Spread(alone, evidence, best + steps, sd_steps, found)
+    half = np.where(inside, _half_widths(spread, window_size), np.inf)
+    return Velocity(step_bins * (found - at_rest), step_bins * half / _SIGMAS)
+
+
+def _parabola(evidence: Floats, place: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+    """Value, slope and negative curvature of the evidence (row, col, velocity) at some places."""
+    around = np.stack([place - 1, place, place + 1], axis=2)
+    around = np.clip(around, 0, evidence.shape[2] - 1)
+    before, at, after = np.moveaxis(np.take_along_axis(evidence, around, axis=2), 2, 0)
+    return at, (after - before) / 2, 2 * at - before - after
+
+
+class _Spread(NamedTuple):
+    """What is known about velocities, in units of their steps, from the first one."""
+
+    alone: Floats
+    """Evidence of each pixel, shape (row, col, velocity)."""
+    evidence: Floats
+    """Evidence of the pixels around it, likewise."""
+    likeliest: Floats
+    """Maximum of that evidence, shape (row, col)."""
+    sd: Floats
+    """Standard deviation of the error of the maximum, likewise, by its curvature."""
+    found: Floats
+    """Estimate, likewise."""
+
+
+def _disagreement(
+    alone: Floats, likeliest: Floats, window_size: int
+) -> tuple[Floats, Floats, Floats]:
+    """Compare the evidence of pixels (row, col, velocity) with the maximum of their neighbourhood.
+
+    Returns
+    -------
+    scatter : ndarray, shape (row, col)
+        Variance of the velocities in the neighbourhood; 0 where it may be chance. The squared slope
+        of the evidence of a pixel exceeds its curvature by the squared curvature times this.
+    widening : ndarray, shape (row, col)
+        Variance of the shared velocity over that by the curvature of the evidence.
+    is_own : ndarray, shape (row, col)
+        Probability that a pixel has a velocity of its own.
+    """
+    (rows, cols, n_steps), half = alone.shape, window_size // 2
+    # Evidence of 0, as beyond the image, agrees with any velocity.
+    around = [(half, half), (half, half)]
+    wide = np.pad(np.pad(alone, [(0, 0), (0, 0), (1, 1)], mode="edge"), [*around, (0, 0)])
+    own = np.pad(np.logaddexp.reduce(alone, axis=2) - math.log(n_steps), around)
+    place = np.rint(likeliest).astype(np.intp)
+    n_pixels, col = window_size**2, np.arange(window_size)[:, np.newaxis] + np.arange(cols)
+    scatter, widening, is_own = np.empty((3, rows, cols))
+    for row in range(rows):
+        near = wide[row : row + window_size]
+        before, at, after = (
+            near[:, col, place[row] + step].reshape(n_pixels, cols) for step in range(3)
+        )
+        off = likeliest[row] - place[row]
+        slope, information = (after - before) / 2, 2 * at - before - after
+        score = slope - information * off
+        beyond = score**2 - information  # 0 on average if all pixels have one velocity
+        excess = beyond.sum(axis=0)
+        chance = np.sqrt(n_pixels * beyond.var(axis=0))
+        is_clear = (excess > _CLEAR_DEVIATIONS * chance) & (n_pixels > 1)
+        known = np.maximum(information, _LEAST_CURVATURE)
+        scatter[row] = np.where(is_clear, excess / (known**2).sum(axis=0), 0.0)
+        widening[row] = np.where(is_clear, 1 + excess / known.sum(axis=0), 1.0)
+        # Share of pixels with a velocity of their own, by expectation maximisation.
+        shared = at + slope * off - information * off**2 / 2
+        own_here = own[row : row + window_size][:, col].reshape(n_pixels, cols)
+        ratio = np.exp(np.clip(own_here - shared, -500.0, 500.0))
+        share = np.full(cols, _SINGLE)
+        for _ in range(_SHARE_STEPS):
+            total = (share * ratio / (1 - share + share * ratio)).sum(axis=0)
+            share = (total + _SINGLE * _PIXELS_KNOWN) / (n_pixels + _PIXELS_KNOWN)
+        middle = ratio[n_pixels // 2]
+        is_own[row] = share * middle / (1 - share + share * middle)
+    return scatter, widening, is_own
+
+
+def _half_widths(spread: _Spread, window_size: int) -> Floats:
+    """Distances (row, col) from the estimates that hold the velocities with 95 % probability.
+
+    The velocity of a pixel is that of its neighbourhood or one of its own, uniform over those
+    tried. How many have one of their own is learned in each neighbourhood. Where the velocities
+    near the shared one scatter by more than chance, it is a pixel's with this scatter.
+    """
+    alone, evidence, likeliest, sd, found = spread
+    n_steps = alone.shape[2]
+    scatter, widening, is_own = _disagreement(alone, likeliest, window_size)
+    # Distributions over the velocities tried; around the maximum, a normal one.
+    steps, peak = np.arange(n_steps), evidence.max(axis=2, keepdims=True)
+    is_far = np.abs(steps - np.rint(likeliest)[..., np.newaxis]) > 1
+    far = np.where(is_far, np.exp(evidence - peak), 0.0)
+    ends = np.rint(likeliest) - 1.5 - likeliest, np.rint(likeliest) + 1.5 - likeliest
+    near = ndtr(ends[1] / sd) - ndtr(ends[0] / sd)
+    mass = sd * near * math.sqrt(2 * math.pi)
+    total = mass + far.sum(axis=2)
+    is_scattered = scatter > 0
+    limits = np.where(is_scattered, -np.inf, ends[0]), np.where(is_scattered, np.inf, ends[1])
+    sd = np.sqrt(widening * sd**2 + scatter)
+    share_near = (1 - is_own) * mass / total / np.where(is_scattered, 1.0, near)
+
+    def near_until(at: Floats) -> Floats:
+        return np.asarray(ndtr(np.clip(at - likeliest, *limits) / sd))
+
+    by_step = (1 - is_own)[..., np.newaxis] * far / total[..., np.newaxis]
+    of_own = np.exp(alone - np.logaddexp.reduce(alone, axis=2, keepdims=True))
+    by_step += is_own[..., np.newaxis] * of_own
+    distance = np.abs(steps - found[..., np.newaxis])
+    low, high = np.zeros(found.shape), np.full(found.shape, float(n_steps))
+    for _ in range(_BISECTIONS):
+        half = (low + high) / 2
+        held = share_near * (near_until(found + half) - near_until(found - half))
+        held += (by_step * np.clip(half[..., np.newaxis] - distance + 0.5, 0.0, 1.0)).sum(axis=2)
+        low, high = np.where(held < _LEVEL, half, low), np.where(held < _LEVEL, high, half)
+    return high
 
 
 def moving_surfaces(
@@ -250,7 +383,8 @@ def moving_surfaces(
 def flux_at_rest(capture: Capture, groups: PulseGroups, travel_bins: Floats) -> FluxModel:
     """Estimate the fluxes of a capture as if its surfaces were at rest.
 
-    Motion spreads an echo over bins, so that its signal is taken for weaker. Here each group is
+    Motion spreads an echo over bins, so that its signal is taken for weaker, and a part of it for a
+    background that varies over the gate. Here each group is
     displaced by whole bins first, and only the bins that all groups then have are used. Where these
     are less than half of the gate, the fluxes are those of the capture as it is.
 
@@ -285,12 +419,18 @@ def flux_at_rest(capture: Capture, groups: PulseGroups, travel_bins: Floats) -> 
         detection=capture.detection,
     )
     found, share = flux_prior_of(inner), n_bins / bins.size
+    shape = found.background_shape
+    if shape is not None:  # beyond the bins in use, that of the nearest one
+        shape = np.pad(shape, edge, mode="edge")
+        share *= float(shape.mean())
+        shape /= shape.mean()
     prior = known._replace(
         levels=found.levels,
         share=found.share,
         background=found.background * share,
         own_weight=found.own_weight,
         contrast=found.contrast and found.contrast / share,
+        background_shape=shape,
     )
     return flux_model_with(capture, prior)
 

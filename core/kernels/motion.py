@@ -81,12 +81,22 @@ def _taps_of(b, prepared, lanes):  # type: ignore[no-untyped-def]
 def _add_displaced(moved, values, sums):  # type: ignore[no-untyped-def]
     """Add the values (bin, lane) of a group, `moved` steps later, to sums (phase, bin, lane).
 
-    Between whole steps, by linear interpolation of the likelihood: a share to either.
+    Between whole steps, by cubic interpolation of the likelihood: linear interpolation flattens its
+    maximum, and so favours displacements of whole steps, such as none.
     """
     n_steps, n_bins, lanes = sums.shape
     below = math.floor(moved)
-    for step in range(below, below + 2):
-        share = np.float32(1.0 - abs(moved - step))
+    x = moved - below
+    shares = (
+        -x * (x - 1.0) * (x - 2.0) / 6.0,
+        (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0,
+        -(x + 1.0) * x * (x - 2.0) / 2.0,
+        (x + 1.0) * x * (x - 1.0) / 6.0,
+    )
+    for i_step in range(4):
+        step, share = below - 1 + i_step, np.float32(shares[i_step])
+        if share == 0.0:
+            continue
         whole, phase = step // n_steps, step % n_steps
         for k in range(max(0, -whole), min(n_bins, n_bins - whole)):
             row, total = values[k + whole], sums[phase, k]
@@ -96,37 +106,41 @@ def _add_displaced(moved, values, sums):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def _fill_ratio(first, gain, loss, fired, unfired, ratio):  # type: ignore[no-untyped-def]
-    """Fill ``T(d)`` (step, bin, lane) of one level, at the first step of each bin or at all.
+    """Fill ``T(d)`` (delay, bin, lane) of one level, at equidistant steps of each bin.
 
     `fired` (node, phase, bin, lane) and `unfired` (phase, bin, lane) are the sums over the groups
     that are displaced by whole bins and `phase` steps.
     """
-    n_steps = len(unfired)
+    n_steps, n_tried = len(unfired), len(ratio)
     ratio[:] = 0.0
-    for step in range(len(ratio)):
+    for delay in range(n_tried):
+        step = delay * n_steps // n_tried
         for phase in range(n_steps):
             at = (step + phase) % n_steps
             tap = first + (step + phase) // n_steps
             for node in range(len(fired)):
-                correlate(gain[node, at], fired[node, phase], tap, ratio[step])
-            correlate(loss[at], unfired[phase], tap, ratio[step])
+                correlate(gain[node, at], fired[node, phase], tap, ratio[delay])
+            correlate(loss[at], unfired[phase], tap, ratio[delay])
 
 
 @njit(**COMPILED)
-def fill_velocity_evidence(first, end, prepared, counts, n_pulses, displaced, evidence):  # type: ignore[no-untyped-def]
+def fill_velocity_evidence(  # type: ignore[no-untyped-def]
+    first, end, prepared, counts, n_pulses, displaced, n_tried, evidence
+):
     """Fill the log likelihood ratio of each velocity to no echo, (velocity, block, lane).
 
-    Averaged over a delay in each bin in the middle of the recording, and over the levels. `counts`
-    is of shape (group, block, bin, lane), `n_pulses` (group,), and `displaced` (velocity, group)
-    are the displacements in steps.
+    Averaged over `n_tried` delays per bin in the middle of the recording, and over the levels.
+    `counts` is of shape (group, block, bin, lane), `n_pulses` (group,), and `displaced` (velocity,
+    group) are the displacements in steps.
     """
     n_velocities, _, lanes = evidence.shape
     n_groups, n_bins, n_nodes = len(counts), counts.shape[2], len(prepared.node)
-    n_levels = len(prepared.signal) - 1
+    n_levels, n_delays = len(prepared.signal) - 1, n_tried * n_bins
     for b in range(first, end):
         fired, unfired, met, left = _groups_of(b, prepared, counts, n_pulses)
         gain, loss = _taps_of(b, prepared, lanes)
-        ratio = lane_rows(n_bins, lanes).reshape(1, n_bins, lanes)
+        ratio = lane_rows(n_delays, lanes).reshape(n_tried, n_bins, lanes)
+        delays = ratio.reshape(n_delays, lanes)
         flat, total = np.empty((n_levels, lanes)), np.empty(lanes)
         highest, row = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
         _, all_fired, _, all_unfired = counts_of(b, prepared)
@@ -142,15 +156,15 @@ def fill_velocity_evidence(first, end, prepared, counts, n_pulses, displaced, ev
             evidence[v, b] = prepared.log_share[0]
             for level in range(n_levels):
                 _fill_ratio(prepared.first_tap, gain[level], loss[level], met, left, ratio)
-                fill_highest(ratio[0], highest)
+                fill_highest(delays, highest)
                 total[:] = 0.0
-                for k in range(n_bins):
+                for d in range(n_delays):
                     for i in range(lanes):
-                        row[i] = exp32(ratio[0, k, i] - highest[i])
+                        row[i] = exp32(delays[d, i] - highest[i])
                     for i in range(lanes):
                         total[i] += row[i]
                 for i in range(lanes):
-                    here = flat[level, i] + highest[i] + math.log(total[i] / n_bins)
+                    here = flat[level, i] + highest[i] + math.log(total[i] / n_delays)
                     most, least = max(here, evidence[v, b, i]), min(here, evidence[v, b, i])
                     evidence[v, b, i] = most + math.log1p(math.exp(least - most))
 

@@ -7,22 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy import stats
 
+import core
 from core import reductions
 from core.acquisition import Acquisition, Flux, Pulse
-from core.capture import Capture
+from core.capture import Capture, Detection
 from core.effects import Motion
 from core.estimators import estimate
 from core.inference import flux_model_of
-from core.inference.motion import shared_velocity, velocity_evidence
+from core.inference.motion import flux_at_rest, shared_velocity, velocity_evidence
 from core.io import save_capture
 from core.io.readers import read_capture
 from core.pulse_groups import PulseGroups, group_sizes
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.methods import motion as study
-from core.trigger import rate_per_bin
+from core.trigger import draw_counts, rate_per_bin
 
 GATE = Acquisition(32, 1e-9, 280e-9, n_pulses=60)
 RATE_HZ = 20e3
@@ -105,7 +107,7 @@ def test_evidence_of_a_velocity_is_that_of_the_equation() -> None:
     assert groups is not None
     travel = np.array([0, 6, -12])  # whole steps in every group: nothing is interpolated
     found = velocity_evidence(capture, groups, flux, travel)[0, 0]
-    delays = np.arange(GATE.n_bins) + 1 / 8  # the first step of each bin
+    delays = np.arange(2 * GATE.n_bins) / 2 + 1 / 8  # two steps of each bin
     left_out = 2e-3 * float(flux.signal.max()) * 60  # photons of an echo beyond its taps
     for travel_bins, log in zip(travel, found, strict=True):
         likelihoods = [
@@ -165,6 +167,105 @@ def test_velocities_are_shared_by_neighbours_only_within_reach() -> None:
     velocity = shared_velocity(both, groups, flux_model_of(both), 12, 5)
     assert np.median(velocity.travel_bins[:, :12]) == pytest.approx(0, abs=0.5)
     assert np.median(velocity.travel_bins[:, 20:]) == pytest.approx(8, abs=0.5)
+
+
+def in_groups(
+    travel_bins: ArrayLike,
+    flux: Flux,
+    side: int = 20,
+    n_groups: int = 40,
+    seed: int = 0,
+    detection: Detection = "first",
+) -> Capture:
+    """Draw an oblique plane in bins 40 to 50 of 100, at rest within each group of 25 pulses."""
+    rng, gate = np.random.default_rng(seed), Acquisition(100, 1e-9, n_pulses=25 * n_groups)
+    onset = 40 + np.add.outer(np.linspace(0, 7, side), np.linspace(0, 3, side))
+    signal, n_pulses = np.full(onset.shape, flux.signal), 25
+    counts = []
+    for middle in (np.arange(n_groups) + 0.5) / n_groups - 0.5:
+        moved = onset + middle * np.asarray(travel_bins)
+        rate = rate_per_bin(moved, signal, flux.background, Pulse(), gate)
+        is_first = detection == "first"
+        cube = draw_counts(rate if is_first else 25 * rate, n_pulses if is_first else None, rng)
+        counts.append(cube.astype(np.uint16))
+    groups = PulseGroups(np.stack(counts), (n_pulses,) * n_groups)
+    truth_m = gate.bin_to_range_m(onset)
+    return Capture(groups.total, gate, truth_range_m=truth_m, detection=detection, groups=groups)
+
+
+def is_covered(hits: int, trials: int, level: float = 0.95) -> bool:
+    """Return whether as many intervals hold the truth as should, but for one seed in 10 000."""
+    low, high = stats.binom.ppf([5e-5, 1 - 5e-5], trials, level)
+    return bool(low <= hits <= high)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("travel_bins", [1.0, 2.5])
+def test_slow_motion_is_not_taken_for_slower(travel_bins: float) -> None:
+    """Displacements between the steps of the delay are as likely as others."""
+    capture = in_groups(travel_bins, Flux(0.3, 1.0), seed=1)
+    assert capture.groups is not None
+    whole = np.full(capture.shape, travel_bins)
+    flux = flux_at_rest(capture, capture.groups, whole)
+    found = shared_velocity(capture, capture.groups, flux, 6, 39)
+    # One estimate from all pixels: a parabola through steps of a bin is right within 0.02.
+    error, sd = found.travel_bins[10, 10] - travel_bins, found.sd_bins[10, 10]
+    assert sd < 0.02
+    assert abs(error) < 4 * sd
+
+
+@pytest.mark.compiled
+def test_a_moving_echo_is_not_taken_for_background() -> None:
+    capture = in_groups(20.0, Flux(sbr=0.1))
+    assert capture.groups is not None
+    assert flux_model_of(capture).background_shape is not None
+    flux = flux_at_rest(capture, capture.groups, np.full(capture.shape, 20.0))
+    assert flux.background_shape is None
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("detection", ["first", "all"])
+def test_intervals_of_moving_surfaces_cover_their_range_and_velocity(detection: Detection) -> None:
+    capture = in_groups(6.0, Flux(sbr=0.3), seed=2, detection=detection)
+    image = estimate(capture, "velocity", neighbourhood=0, most_bins=12)
+    assert image.velocity is not None
+    truth_m = np.asarray(capture.truth_range_m)
+    right = np.abs(image.range_m - truth_m) <= 3 * capture.acquisition.bin_length_m
+    assert right.mean() > 0.99
+    for level in (0.68, 0.95):
+        low_m, high_m = core.range_interval(capture, image, level)
+        holds = (low_m <= truth_m) & (truth_m <= high_m)
+        # Of first photons, 0.42 at 0.68 by the sum of the pulses.
+        assert is_covered(int(holds[right].sum()), int(right.sum()), level), holds.mean()
+        row, col = 3, 4
+        (one,) = core.pixel_range_intervals(capture, image, row, col, (level,))
+        assert (one.low, one.high) == (low_m[row, col], high_m[row, col])
+    holds = np.abs(image.velocity.bins - 6.0) <= 1.96 * image.velocity.sd_bins
+    assert is_covered(int(holds.sum()), holds.size), holds.mean()
+
+
+@pytest.mark.compiled
+def test_intervals_of_velocities_hold_slow_motion_that_is_taken_for_rest() -> None:
+    """Rest is likelier before, but an interval shows what the photons leave open."""
+    capture = in_groups(1.0, Flux(sbr=0.1), seed=3)
+    found = estimate(capture, "velocity", neighbourhood=0, most_bins=12).velocity
+    assert found is not None
+    assert (found.bins == 0).mean() > 0.5
+    holds = np.abs(found.bins - 1.0) <= 1.96 * found.sd_bins
+    assert holds.mean() > 0.95 - 4 * np.sqrt(0.95 * 0.05 / holds.size)
+
+
+@pytest.mark.compiled
+def test_intervals_of_velocities_widen_where_those_of_neighbours_differ() -> None:
+    """Pixels that share a velocity, but turn or are two objects, do not have one of their mean."""
+    turning = np.broadcast_to(np.linspace(-6, 6, 20), (20, 20))
+    for travel_bins in (turning, np.where(turning < 0, -4.0, 4.0)):
+        capture = in_groups(travel_bins, Flux(sbr=0.1), seed=4)
+        found = estimate(capture, "velocity", most_bins=12).velocity
+        assert found is not None
+        holds = np.abs(found.bins - travel_bins) <= 1.96 * found.sd_bins
+        # With the curvature of the evidence alone, 0.42 where they turn.
+        assert holds.mean() > 0.9
 
 
 REDUCED = {
