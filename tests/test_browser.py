@@ -656,6 +656,9 @@ WebSocket.prototype.send = function (part) {
 """
 
 
+NOTE_FIRST = NOTE_SIZES + NOTE_SENT
+"""JavaScript that notes sizes of plots and messages from the beginning."""
+
 NOTE_COLORS = """(label) => {
   const seen = (window.seen = []);
   const look = () => {
@@ -694,26 +697,25 @@ def change_theme(page: Page) -> None:
     assert {event["attr"] for event in sent} == {"dark_theme"}
 
 
-def test_a_page_opens_complete_follows_the_theme_and_shows_scenes_in_every_way(page):
-    new = page(prepare=NOTE_SIZES + NOTE_SENT)
-    expect_all_in_place(new)
-    change_theme(new)
-    shown, sources = look(new), built_in_sources()
+def show_scenes_in_every_way(page: Page) -> None:
+    """Show scenes, and the car in pictures of each kind; the last is the estimate again."""
+    shown, sources = look(page), built_in_sources()
     for key in ("car_256", "sample", "car"):
-        choose(new, "Scene or capture", sources[key].title)
-        shown = look_again(new, shown, "image", "cloud", least_ranges=51)
+        choose(page, "Scene or capture", sources[key].title)
+        shown = look_again(page, shown, "image", "cloud", least_ranges=51)
     for of_image, of_cloud in (("Error", "Error"), ("Counts", "Counts"), ("Truth", "Range")):
-        new.get_by_role("button", name=of_image, exact=True).first.click()
-        new.get_by_role("button", name=of_cloud, exact=True).last.click()
-        shown = look_again(new, shown, "image", "cloud")
-    new.evaluate(LAY_OUT_UNFINISHED)  # must not raise
-    assert new.evaluate(HIDE_AND_SHOW) == {
+        page.get_by_role("button", name=of_image, exact=True).first.click()
+        page.get_by_role("button", name=of_cloud, exact=True).last.click()
+        shown = look_again(page, shown, "image", "cloud")
+    page.get_by_role("button", name="Estimate", exact=True).first.click()
+    look_again(page, shown, "image")
+    page.evaluate(LAY_OUT_UNFINISHED)  # must not raise
+    assert page.evaluate(HIDE_AND_SHOW) == {
         "laid out": 1,
         "sheets written": 0,
         "measured for components": 0,
     }
-    expect(warning(new)).to_be_hidden()
-    expect_inspect_in_place(new)
+    expect(warning(page)).to_be_hidden()
 
 
 LAY_OUT_UNFINISHED = f"""() => {{

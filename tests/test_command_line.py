@@ -15,10 +15,9 @@ from playwright.sync_api import Page, expect
 
 import core
 from app.model.large import LIMIT
-from app.model.store import content_key
 from app.model.uploads import safe_name
 from app.server.access import TOKEN_VARIABLE
-from tests.browser import fact, serving, upload
+from tests.browser import TIMEOUT_MS, choose, chosen, fact, serving, upload
 from tests.site import TOKEN
 from tests.test_large import write
 from tests.test_uploads import saved
@@ -52,6 +51,7 @@ def served(tmp_path_factory):
 def test_the_token_form_admits_to_the_address_that_was_asked_for(browser, served):
     _, address, _ = served
     context = browser.new_context()
+    context.set_default_timeout(TIMEOUT_MS)
     page = context.new_page()
     page.goto(f"{address}?unit=ns")
     page.get_by_label("Token").fill("something else")
@@ -70,25 +70,19 @@ def check_harmless(page):
     assert page.title() == "firstphoton"
 
 
-def test_file_names_are_shown_as_text_on_every_page(page, served):
-    path, address, _ = served
-    second = content_key(path.parent / GIVEN)
-    new = page(f"{address}?{urlencode({'token': TOKEN, 'source': second})}")
-    source = new.get_by_role("combobox", name=re.compile("^Scene or capture"))
+def show_file_names_as_text(new: Page, folder: Path) -> None:
+    """Choose the capture `GIVEN`, visit every page, and upload files of such names."""
+    choose(new, "Scene or capture", GIVEN)
+    source = chosen(new, "Scene or capture")
     for shown in ("Explore", "Compare", "Trade-off", "Paper", "Inspect"):
         button = new.get_by_role("button", name=shown, exact=True)
         button.click()
         expect(button).to_have_attribute("aria-pressed", "true")
         new.wait_for_function("Bokeh.documents[0].is_idle")
         check_harmless(new)
-    expect(source).to_have_text(GIVEN)
     expect(new.get_by_text("4 × 6 pixels, 37 bins")).to_contain_text(DESCRIPTION)
-    source.click()
-    expect(new.get_by_role("menuitem", name=GIVEN, exact=True)).to_be_visible()
-    check_harmless(new)
-    new.keyboard.press("Escape")
     for content, names in (
-        ((path.parent / GIVEN).read_bytes(), source),
+        ((folder / GIVEN).read_bytes(), source),
         (b"no capture", new.get_by_role("alert")),
     ):
         upload(new, UPLOADED, content)
@@ -133,7 +127,7 @@ def endless(chunk: Path) -> Iterator[None]:
         chunk.write_bytes(kept)
 
 
-def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
+def test_a_large_capture_is_looked_at_closer_and_file_names_are_shown_as_text(page, served):
     path, address, capture = served
     opened = page(f"{address}?{urlencode({'token': TOKEN})}")
     closer = opened.get_by_role("button", name="Read window")
@@ -178,3 +172,4 @@ def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     opened.get_by_role("button", name="Show all").click()
     expect(preview).to_be_visible()
     shows(opened, "0 to 511", "0 to 511")
+    show_file_names_as_text(opened, path.parent)

@@ -7,10 +7,17 @@ from playwright.sync_api import Page, expect
 
 from app.pages.catalog import PAGES
 from tests.browser import EDGES, VIEWS, eventually, image, slider, stage
-from tests.test_browser import use_the_controls
+from tests.test_browser import (
+    NOTE_FIRST,
+    change_theme,
+    expect_all_in_place,
+    expect_inspect_in_place,
+    show_scenes_in_every_way,
+    use_the_controls,
+)
 from tests.test_compare import compare_the_methods
 from tests.test_inspect_browser import expect_a_steady_frame, inspect_the_building
-from tests.test_lessons import take_the_first_lesson
+from tests.test_lessons import take_lessons_of_every_kind
 from tests.test_paper_page import read_part_by_part
 from tests.test_tradeoff_page import open_a_configuration
 
@@ -127,10 +134,11 @@ def expect_the_sidebar_to_be_skipped(page: Page) -> None:
 
 
 def explore(page: Page) -> None:
-    expect_the_sidebar_to_be_skipped(page)
     expect_a_print_of_the_content(page)
     expect_a_steady_frame(page)
+    show_scenes_in_every_way(page)
     use_the_controls(page)
+    expect_inspect_in_place(page)
 
 
 JOURNEYS = {
@@ -139,7 +147,7 @@ JOURNEYS = {
     "Compare": compare_the_methods,
     "Trade-off": open_a_configuration,
     "Paper": read_part_by_part,
-    "Learn": take_the_first_lesson,
+    "Learn": take_lessons_of_every_kind,
 }
 """Actions of a user on a page that has just been opened, by its name."""
 
@@ -149,7 +157,13 @@ OTHERWISE = {"Inspect": "&source=building&pixel=[30,20]"}
 
 @pytest.mark.parametrize("name", [each.name for each in PAGES])
 def test_a_page_opens_first_has_plots_that_can_be_read_and_is_used(page, address, name):
-    opened = page(f"{address}?page={name}{OTHERWISE.get(name, '')}", ready=".bk-Figure")
+    link = f"{address}?page={name}{OTHERWISE.get(name, '')}"
+    is_noted = name == "Explore"
+    opened = page(link, ready=".bk-Figure", prepare=NOTE_FIRST if is_noted else "")
+    if is_noted:
+        expect_all_in_place(opened)
+        expect_the_sidebar_to_be_skipped(opened)
+        change_theme(opened)
     expect_readable(opened, name)
     expect_a_print_that_states_its_link(opened)
     JOURNEYS[name](opened)

@@ -610,15 +610,14 @@ def take(here: Page, lesson: Lesson) -> None:
         expect(here.get_by_role("status").filter(has_text=said)).to_be_visible()
 
 
-@pytest.mark.browser
-def test_lessons_of_every_kind_are_taken_by_keyboard_one_after_another(page, address):
-    """`take_the_first_lesson` takes the first, and a test without a browser takes each."""
+def take_lessons_of_every_kind(here: Page) -> None:
+    """Take the first lesson, and one of each other kind, one after the other."""
+    take_the_first_lesson(here)
     kinds = {}
     for lesson in LESSONS.values():
         kind = bool(lesson.prediction.axis), isinstance(SPECS[lesson.control], Choice)
         kinds.setdefault(kind, lesson)
     _, *others = kinds.values()
-    here = page(f"{address}?page=Learn&learning.lesson={others[0].key}", ready=".bk-Figure")
     for lesson in others:
         choose(here, "Lesson", numbered(lesson))
         take(here, lesson)
