@@ -31,6 +31,7 @@ from app.model.store import (
 from app.pages.catalog import PAGES
 from app.pages.explore import text as explore_text
 from app.pages.layout import CUSTOM, HELP, MORE_TRACKING, Layout
+from app.pages.session import Session
 from app.pages.shared import measure
 from app.pages.shared.estimate import lane_of
 from app.pages.shared.illumination import MORE, IlluminationPanel
@@ -50,7 +51,7 @@ from core.parameters import Number, spec_of
 from core.reductions import Reduction
 from core.tests.read_options import EXAMPLES
 from tests.states import ask, link_to
-from tests.threads import HeldLayout, control
+from tests.threads import HeldLayout, HeldTasks, control
 
 NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
 
@@ -641,9 +642,18 @@ def values_of(facts):
     return {name: value for name, value, _ in facts.facts}
 
 
-def test_a_page_is_complete(own_layout):
-    layout, explore = own_layout, own_layout.contents["Explore"]
-    session = layout.session
+def test_a_page_opens_complete_and_draws_its_pixel_once(monkeypatch):
+    drawn = []
+
+    def counted(*arguments):
+        drawn.append(arguments)
+        return inspect(*arguments)
+
+    monkeypatch.setattr("app.pages.explore.page.inspect", counted)
+    layout = HeldLayout(built_in_sources())
+    layout.settle()
+    assert len(drawn) == 1
+    explore, session = layout.contents["Explore"], layout.session
     assert values_of(explore.figures)["RMSE"] == f"{session.answer.run.figures['rmse_m']:.4g} m"
     assert values_of(explore.numbers)["Pixel"] == "row {}, col {}".format(*session.state.pixel)
     assert np.isfinite(session.answer.capture.truth_range_m[session.state.pixel])
@@ -655,19 +665,6 @@ def test_a_page_is_complete(own_layout):
     kinds = [type(part).__name__ for part in model.references()]
     assert kinds.count("figure") == 4  # one more is sent when it is first shown
     assert sum(kind.startswith("PointCloud") for kind in kinds) == 1
-
-
-def test_a_page_draws_its_pixel_once_when_it_opens(monkeypatch):
-    drawn = []
-
-    def counted(*arguments):
-        drawn.append(arguments)
-        return inspect(*arguments)
-
-    monkeypatch.setattr("app.pages.explore.page.inspect", counted)
-    layout = HeldLayout(built_in_sources())
-    layout.settle()
-    assert len(drawn) == 1
 
 
 def draw_in_every_way(layout, explore):
@@ -1085,13 +1082,11 @@ def test_a_page_that_does_not_exist_is_refused_by_name():
     assert "page = 'Nowhere' is not accepted: give Explore, Inspect" in layout.alert.text
 
 
-def test_sessions_share_no_control_and_no_source(own_layout):
-    other = Layout(built_in_sources())
-    knobs = [set(map(id, each.page.select(Knob))) for each in (own_layout, other)]
-    assert len(knobs[0]) == len(knobs[1]) > 0
-    assert not knobs[0] & knobs[1]
-    own_layout.session.sources["mine"] = own_layout.session.sources["car"]
-    assert "mine" not in other.session.sources
+def test_sessions_share_no_control_and_no_source(layout, own_layout):
+    knobs = [set(map(id, each.page.select(Knob))) for each in (layout, own_layout)]
+    assert all(knobs) and not knobs[0] & knobs[1]
+    layout.session.sources["mine"] = layout.session.sources["car"]
+    assert "mine" not in own_layout.session.sources
 
 
 def test_only_the_first_estimate_of_a_scene_is_shared_and_only_where_requests_are_equal(tmp_path):
@@ -1100,19 +1095,19 @@ def test_only_the_first_estimate_of_a_scene_is_shared_and_only_where_requests_ar
     sources = built_in_sources() | {"file": file_source(path)}
 
     def opened(**chosen):
-        return HeldLayout(sources, Link(chosen)).session.answer
+        return Session(sources, Link(chosen), HeldTasks()).answer
 
     assert opened() is opened()
     assert opened(**{"light.sbr": "0.2"}) is not opened()
     assert opened(source="file") is not opened(source="file")
 
 
-def test_the_bar_of_long_work_comes_and_goes_in_its_own_place(own_layout):
-    (bar,) = own_layout.page.select(pmui.LinearProgress)
+def test_the_bar_of_long_work_comes_and_goes_in_its_own_place(layout):
+    (bar,) = layout.page.select(pmui.LinearProgress)
     place = bar.visible, bar.height
     shown = []
     for is_busy in (False, True, False):
-        own_layout.session.tasks.busy.changed.emit(is_busy)
+        layout.session.tasks.busy.changed.emit(is_busy)
         shown.append("display" not in bar.sx)
         assert (bar.visible, bar.height) == place == (True, 4)
     assert shown == [False, True, False]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
+from types import SimpleNamespace
 
 import pytest
 
@@ -32,21 +31,27 @@ def test_the_exit_status_is_0_if_all_attacks_held(monkeypatch, capsys):
     assert attack.main(["--only", "no such attack"]) == 1
 
 
-def test_a_server_that_ends_has_not_held(monkeypatch, capsys):
-    def harmless(server):
-        return Outcome(1, "nothing", server.is_alive)
-
-    def deadly(server):
-        os.kill(server.process.pid, signal.SIGKILL)
-        server.process.wait()
-        return Outcome(1, "killed", True)
-
-    attacks = [Attack("harmless", harmless), Attack("deadly", deadly)]
-    monkeypatch.setattr(attack, "ATTACKS", attacks)
-    assert attack.main([]) == 1
-    harmless_row, deadly_row = capsys.readouterr().out.splitlines()[2:4]
-    assert "ENDED" in deadly_row and "did NOT hold" in deadly_row
-    assert harmless_row.endswith("| held |")
+@pytest.mark.parametrize(
+    ("is_alive", "is_lost", "longest_s", "text"),
+    [
+        (True, False, 0.2, "| 200 | 0.2 s |"),
+        (False, False, 0.2, "200; the server ENDED (last words)"),
+        (True, True, 0.2, "200; another session was LOST"),
+        (True, False, 9.0, "| 200 | 9.0 s |"),
+    ],
+)
+def test_an_attack_holds_if_the_server_goes_on_serving(
+    monkeypatch, tmp_path, is_alive, is_lost, longest_s, text
+):
+    monkeypatch.setattr(attack.time, "sleep", lambda _s: None)
+    memory = SimpleNamespace(is_killed=False, peak_bytes=7 * MIB)
+    server = SimpleNamespace(is_alive=is_alive, memory=memory, logged=lambda: "last words\n")
+    other = SimpleNamespace(is_lost=is_lost, longest_s=longest_s)
+    target = SimpleNamespace(healthy=lambda: (server, other))
+    one = Attack("one", lambda _: Outcome(1, "200", held=True))
+    row, has_held = attack.row_of(one, target, tmp_path)
+    assert text in row and "| 7 MiB |" in row
+    assert has_held == row.endswith("| held |") == (text == "| 200 | 0.2 s |")
 
 
 @pytest.mark.parametrize(

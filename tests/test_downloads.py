@@ -334,16 +334,26 @@ def test_descriptions_state_version_method_all_settings_and_source(explore, sess
     assert f"settings: {viewing}" in settings
 
 
+LEAST = 1 - 1e-9
+
+
+@pytest.fixture(scope="module")
+def intervals(layout):
+    """The range intervals of the estimates of at least this confidence."""
+    answer = layout.session.answer
+    return range_intervals(answer.capture, answer.run.image.confident(LEAST))
+
+
 @pytest.mark.parametrize("kind", [kind for kind in MAPS if kind != VELOCITY])
-def test_arrays_and_pages_hold_the_map_that_is_shown(explore, session, kind):
-    viewing = Viewing(least_confidence=1 - 1e-9)
+def test_arrays_and_pages_hold_the_map_that_is_shown(explore, session, intervals, kind):
+    viewing = Viewing(least_confidence=LEAST)
     values, look = map_of(session.answer, kind, viewing)
     files = image_files(session.answer, kind, viewing, explore.image.figure)
     name = {"Estimate": "range_m", "Goodness of fit": "fit_p_value"}.get(kind, kind.lower())
     arrays = np.load(io.BytesIO(written(files["npz"])))
     np.testing.assert_array_equal(arrays[name], values)
-    image, limits = session.answer.run.image.confident(viewing.least_confidence), {}
-    inner, outer = range_intervals(session.answer.capture, image)
+    limits = {}
+    inner, outer = intervals
     for level, ends in (("68_", inner), ("", outer)):
         limits |= {f"range_low_{level}m": ends.low_m, f"range_high_{level}m": ends.high_m}
     for limit, expected in limits.items():

@@ -13,6 +13,7 @@ from app.model.state import Viewing
 from app.model.store import Request, built_in_sources, compute, file_source
 from app.pages.inspect import text
 from app.pages.inspect.results import inspect_pixel
+from app.pages.session import Session
 from core.io import ReadOptions
 from tests.states import link_to
 from tests.threads import HeldLayout, control
@@ -53,9 +54,9 @@ def test_files_of_one_pattern_are_stepped_through(tmp_path):
     assert control(layout, "Record").end == 2
     control(layout, "Record").value = 1
     np.testing.assert_array_equal(layout.next_answer().whole.cube, cube + 1)
-    again = HeldLayout(files, link_to(layout.session.query()))
-    assert again.session.refused == []
-    np.testing.assert_array_equal(again.session.answer.whole.cube, cube + 1)
+    again = Session(files, link_to(layout.session.query()))
+    assert again.refused == []
+    np.testing.assert_array_equal(again.answer.whole.cube, cube + 1)
 
 
 def test_the_player_is_shown_for_sequences_alone(log):

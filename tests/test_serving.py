@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
@@ -182,6 +183,7 @@ def run(*arguments):
     with subprocess.Popen(
         [sys.executable, *arguments],
         cwd=ROOT,
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -224,6 +226,41 @@ def test_the_printed_link_has_a_token_and_ctrl_c_stops():
     assert "Traceback" not in rest
 
 
+FORKING = """
+import os, sys
+from app import __main__
+print("ready", flush=True)
+for script in sys.stdin:
+    if not os.fork():
+        exec(eval(script), {})
+    _, status = os.wait()
+    print("status", os.waitstatus_to_exitcode(status), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def forking():
+    """A process that runs scripts: importing the app, which it has done, takes seconds."""
+    with run("-c", FORKING) as process:
+        assert next(process.stdout) == "ready\n"
+        yield process
+
+
+def begin(forking, script):
+    forking.stdin.write(f"{script!r}\n")
+    forking.stdin.flush()
+
+
+def ended(forking):
+    """Return what the last script has printed until it ended, and its status."""
+    printed = []
+    for line in forking.stdout:
+        if line.startswith("status"):
+            return "".join(printed), int(line.split()[1])
+        printed.append(line)
+    raise AssertionError("".join(printed))
+
+
 STOPPED_AT_A_BAD_MOMENT = """
 import os, signal, sys, time
 from contextlib import suppress
@@ -257,24 +294,24 @@ sys.exit(started.main(["--port", "0"]))
 """
 
 
-def test_sigterm_stops_at_any_time_and_cancels_long_work():
-    with run("-c", STOPPED_AT_A_BAD_MOMENT) as server:
-        line = next(line for line in server.stdout if line.startswith("Open"))
-        Site(line.split()[1]).ask()
-        rest = server.communicate(timeout=60)[0]
+def test_sigterm_stops_at_any_time_and_cancels_long_work(forking):
+    begin(forking, STOPPED_AT_A_BAD_MOMENT)
+    line = next(line for line in forking.stdout if line.startswith("Open"))
+    Site(line.split()[1]).ask()
+    printed, status = ended(forking)
     for word in ("begun", "now", "ended"):  # written by two threads, so that lines may run together
-        assert word in rest
-    assert server.returncode == 0
+        assert word in printed
+    assert status == 0
 
 
 COMPILING = """
-import sys, time
+import os, sys, time
 import core
 from app.__main__ import main
 
 def compiling(progress=None, only=None):
     if only == {only!r}:
-        print("compiling", flush=True)
+        print("compiling", os.getpid(), flush=True)
         time.sleep(600)
 
 core.warm_up = compiling
@@ -290,9 +327,8 @@ sys.exit(main(["--port", "0"]))
         (None, signal.SIGTERM),  # meanwhile, when both have one handler
     ],
 )
-def test_what_ends_the_app_does_so_while_kernels_are_compiled(only, number):
-    with run("-c", COMPILING.format(only=only)) as server:
-        while next(server.stdout) != "compiling\n":
-            pass
-        server.send_signal(number)
-        assert server.wait(timeout=60) == (0 if only is None else -number)
+def test_what_ends_the_app_does_so_while_kernels_are_compiled(forking, only, number):
+    begin(forking, COMPILING.format(only=only))
+    line = next(line for line in forking.stdout if line.startswith("compiling"))
+    os.kill(int(line.split()[1]), number)
+    assert ended(forking)[1] == (0 if only is None else -number)

@@ -77,9 +77,9 @@ def test_a_file_of_several_arrays_is_served_and_the_page_asks_for_one(tmp_path, 
     assert answer.request.source.title == "two.mat"
     assert answer.capture.counts.sum() == CUBE.sum()
     assert layout.session.state.page == "Inspect"
-    again = HeldLayout(files | built_in_sources(), link_to(layout.session.query()))
-    assert again.session.answer.request.source.title == "two.mat"
-    assert again.alert.text == ""
+    again = Session(files | built_in_sources(), link_to(layout.session.query()))
+    assert again.answer.request.source.title == "two.mat"
+    assert again.refused == [] and again.estimate.refused is None
 
 
 def test_the_page_asks_whether_an_array_holds_raw_frames(tmp_path):

@@ -7,9 +7,11 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from email import message_from_string
 from zipfile import ZipFile
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 import core
 from tests.browser import ROOT
@@ -19,11 +21,8 @@ from tests.wheel import (
     install,
     outside,
     pythons,
-    run,
     start_page,
 )
-
-VERSION = f"firstphoton {core.__version__}"
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +45,6 @@ def test_the_installed_wheel_describes_the_sample_and_serves_the_app(wheel, tmp_
     (packages,) = commands.parent.glob("lib/python*/site-packages")
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     _take_compiled_kernels(packages / "core")
-    assert run(commands / "firstphoton", "--version") == VERSION
     assert "Sample capture" in describe_sample(commands)
     assert "<title>firstphoton</title>" in start_page(commands)
 
@@ -64,9 +62,13 @@ def _take_compiled_kernels(installed):
 
 def test_every_python_of_this_machine_accepts_the_wheel(wheel, tmp_path):
     """Only metadata and syntax: the dependencies are installed for one Python."""
+    assert wheel.name == f"firstphoton-{core.__version__}-py3-none-any.whl"
+    with ZipFile(wheel) as packed:
+        packed.extractall(tmp_path)
+    (metadata,) = tmp_path.glob("*.dist-info/METADATA")
+    required = message_from_string(metadata.read_text("utf-8"))["Requires-Python"]
     found = pythons() | {"{}.{}".format(*sys.version_info): sys.executable}
     for version, python in found.items():
-        commands = install(wheel, python, tmp_path / version, dependencies=False)
-        (packages,) = commands.parent.glob("lib/python*/site-packages")
-        compiling = [commands / "python", "-m", "compileall", "-q", packages]
+        assert version in SpecifierSet(required)
+        compiling = [python, "-m", "compileall", "-q", tmp_path]
         subprocess.run(compiling, env=outside(), check=True)
