@@ -92,7 +92,8 @@ class ImageParameters(Settings):
     false_surface: float = parameter(
         0.01,
         Number("False surfaces", 1e-4, 0.1, log=True, least=0.0, open_below=True, most=1.0),
-        "If empty pixels are allowed: largest share of them that may get a range.",
+        "If empty pixels are allowed: largest share of them that may get a range. Most of those "
+        "that do are next to a surface.",
     )
 
 

@@ -41,10 +41,8 @@ _LEVEL = 0.95
 _BISECTIONS = 40
 _LEAST_CURVATURE = 1e-9
 _TRIED_PER_BIN = 2  # delays whose mean is the evidence; one would depend on where in a bin they lie
-_SINGLE, _PIXELS_KNOWN = (
-    0.01,
-    50.0,
-)  # prior share of pixels with a velocity of their own, its weight
+_SINGLE = 0.01  # prior share of pixels with a velocity of their own
+_PIXELS_KNOWN = 50.0  # pixels that this prior counts for
 _SHARE_STEPS = 10
 _CLEAR_DEVIATIONS = 2.0  # of the spread of the velocities of a neighbourhood, beyond chance
 _FINE = 4  # velocities per bin for which delays are found
