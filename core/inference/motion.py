@@ -228,7 +228,7 @@ def _parabola(evidence: Floats, place: NDArray[np.intp]) -> tuple[Floats, Floats
 
 
 class _Spread(NamedTuple):
-    """What is known about velocities, in units of their steps, from the first one."""
+    """Evidence and estimates of velocities, in units of their steps, from the first one."""
 
     alone: Floats
     """Evidence of each pixel, shape (row, col, velocity)."""

@@ -216,7 +216,7 @@ def test_own_layout_lists_guesses_for_missing_fields(write: Write) -> None:
 
 
 def test_own_layout_without_a_pulse_has_the_one_of_its_counts(write: Write) -> None:
-    """As other files have, and told in the same words."""
+    """As for other files, and stated in the same words."""
     slope = 30 + np.arange(20) / 2 + np.zeros((20, 1))
     echo = 3.0 * ndtr((np.arange(81) - slope[..., np.newaxis]) / 2)
     shares = np.diff(-np.expm1(-echo), append=1.0)
