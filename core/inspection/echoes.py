@@ -181,7 +181,7 @@ def _photons_between(
 ) -> list[_Photons] | None:
     """Photons of the ordinary pixels between successive bins; None if too few pulses are left.
 
-    By default in any pixel, or in the mean one.
+    `of_pixels` says in which: `numpy.min` in any pixel, `numpy.mean` in the mean one.
     """
     kept, n_pulses = capture.cube[ordinary_pixels(capture)], capture.gated_pulses
     counts = np.stack(
