@@ -177,19 +177,37 @@ def _fill_peaks(b, prepared, best, around):  # type: ignore[no-untyped-def]
     density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
     top, offset = np.empty(lanes), np.empty((n_levels, lanes))
     _fill_density(b, prepared, ratio, offset, density, top)
-    highest, at = np.full(lanes, -1.0, np.float32), np.zeros(lanes, np.int32)
-    for d in range(n_delays):
-        for i in range(lanes):
-            here, most, before = density[d, i], highest[i], at[i]
-            at[i] = d if here > most else before
-            highest[i] = here if here > most else most
+    at = np.empty(lanes, np.int32)
+    _fill_argmax(density, at)
     for i in range(lanes):
         best[i] = at[i]
         for j in range(3):
             d = min(max(at[i] + j - 1, 0), n_delays - 1)
-            log = ratio[:, d % n_steps, d // n_steps, i] + offset[:, i]
-            most = log.max()
-            around[i, j] = most + math.log(np.exp(log - most).sum() * prepared.depth[d])
+            log = ratio[:, d % n_steps, d // n_steps]
+            around[i, j] = _log_sum(prepared.depth[d], log, offset, i)
+
+
+@njit(**COMPILED)
+def _fill_argmax(density, at):  # type: ignore[no-untyped-def]
+    """Fill `at` (lane,) with the first row of the maximum of `density` (row, lane)."""
+    highest = np.full(at.size, -1.0, np.float32)
+    at[:] = 0
+    for d in range(len(density)):
+        for i in range(at.size):
+            here, most, before = density[d, i], highest[i], at[i]
+            at[i] = d if here > most else before
+            highest[i] = here if here > most else most
+
+
+@njit(**COMPILED)
+def _log_sum(factor, log, offset, i):  # type: ignore[no-untyped-def]
+    """Return ``ln (factor Σ_level exp(log + offset))`` of a lane, from (level, lane) each."""
+    most, total = -np.inf, 0.0
+    for level in range(len(log)):
+        most = max(most, log[level, i] + offset[level, i])
+    for level in range(len(log)):
+        total += math.exp(log[level, i] + offset[level, i] - most)
+    return most + math.log(factor * total)
 
 
 @njit(**COMPILED)

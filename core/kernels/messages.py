@@ -26,6 +26,7 @@ STEEPEST = 24.0
 """Largest slope in bins per pixel; steeper slopes are clipped."""
 
 _MARGIN = int(STEEPEST) + MOST_TAPS  # bins on either side of the gate that a message may read
+_TAPS_AT_ONCE = 4
 
 
 @njit(**SUMMING)
@@ -54,11 +55,11 @@ def _pass_on(weights, nothing, total, slope, link, taps, sums, message):  # type
     for j in range(1, n_taps):
         taps[j] = (1 - part) * link.kernel[j] + part * link.kernel[j - 1]
     sums[:] = 0.0
-    for j in range(n_taps + 1):
-        first = _MARGIN - whole + n_taps // 2 - j
-        met, tap = weights[first : first + n_bins], taps[j]
+    for j in range(0, taps.size, _TAPS_AT_ONCE):
+        first = _MARGIN - whole + n_taps // 2 - j - 3
+        met, t0, t1, t2, t3 = weights[first:], taps[j], taps[j + 1], taps[j + 2], taps[j + 3]
         for d in range(n_bins):
-            sums[d] += tap * met[d]
+            sums[d] += t0 * met[d + 3] + t1 * met[d + 2] + t2 * met[d + 1] + t3 * met[d]
     leak, gain = np.float32(1.0) - link.share, link.share / total
     for d in range(n_bins):
         message[d] = leak + gain * link.per_prior[d] * sums[d]
@@ -108,7 +109,7 @@ def fill_posterior(  # type: ignore[no-untyped-def]
         weights = np.zeros(n_bins + 2 * _MARGIN, np.float32)
         inner = weights[_MARGIN : _MARGIN + n_bins]
         message, sums = np.ones(n_bins, np.float32), np.empty(n_bins, np.float32)
-        taps = np.empty(link.kernel.size + 1, np.float32)
+        taps = np.zeros(-(-(link.kernel.size + 1) // _TAPS_AT_ONCE) * _TAPS_AT_ONCE, np.float32)
         on_nothing = np.float32(1.0)
         for i in range(length):
             at = line * line_step + i * step
@@ -139,12 +140,14 @@ def fill_lags(first, end, one, other, lags):  # type: ignore[no-untyped-def]
     `one` and `other` are of shape (pixel, bin).
     """
     n_bins, half = one.shape[1], lags.shape[1] // 2
+    padded = np.zeros(n_bins + 2 * half, np.float32)  # sums of equal length are vectorised
     for i in range(first, end):
-        for lag in range(-half, half + 1):
-            total = np.float32(0.0)
-            for d in range(max(0, -lag), min(n_bins, n_bins - lag)):
-                total += one[i, d + lag] * other[i, d]
-            lags[i, lag + half] = total
+        padded[half : half + n_bins] = one[i]
+        for lag in range(lags.shape[1]):
+            shifted, total = padded[lag:], np.float32(0.0)
+            for d in range(n_bins):
+                total += shifted[d] * other[i, d]
+            lags[i, lag] = total
 
 
 @njit(**COMPILED)

@@ -451,23 +451,51 @@ def _fill_rate(i, model, background, signal, delay, rate):  # type: ignore[no-un
 
 
 @njit(**COMPILED)
-def _fill_more(i, model, background, signal, delay, more):  # type: ignore[no-untyped-def]
-    """Fill ``exp(rate) - 1`` for first photons, else the rate, of each bin; see `_fill_rate`."""
-    _fill_rate(i, model, background, signal, delay, more)
-    if model.is_first:
-        rate, of_rate = 0.0, 0.0
-        for k in range(more.size):
-            if more[k] != rate:  # mostly as before, and exponentials are slow
-                rate = more[k]
-                of_rate = math.expm1(rate)
-            more[k] = of_rate
+def _met_bins(i, model, signal, delay):  # type: ignore[no-untyped-def]
+    """Return the first of the bins that may not be alike, and their end.
+
+    Those that the echoes (echo, pixel) of pixel i meet, and any in between; all of them over a
+    background that varies.
+    """
+    n_bins, n_taps = model.background.size, model.echo.shape[1]
+    first, end = n_bins, 0
+    for j in range(len(signal)):
+        if signal[j, i] > 0:
+            begin = math.floor(delay[j, i]) + model.first_tap
+            first, end = min(first, max(begin, 0)), max(end, min(begin + n_taps, n_bins))
+    return (first, end) if model.is_uniform else (0, n_bins)
 
 
 @njit(**COMPILED)
-def _add_tap(photons, gain, fired, unfired, per_more, log):  # type: ignore[no-untyped-def]
-    """Add to `log` what the bins (n,) that one tap of an echo meets add to ℓ."""
+def _fill_more(i, model, background, signal, delay, met, more):  # type: ignore[no-untyped-def]
+    """Fill ``exp(rate) - 1`` for first photons, else the rate, of the bins of `_met_bins`.
+
+    Returns that of the other bins. See `_fill_rate`.
+    """
+    _fill_rate(i, model, background, signal, delay, more)
+    alone = background * model.background[0]
+    if not model.is_first:
+        return alone
+    for k in range(met[0], met[1]):
+        more[k] = math.expm1(more[k])
+    return math.expm1(alone)
+
+
+@njit(**COMPILED)
+def _add_tap(photons, gained, fired, unfired, log):  # type: ignore[no-untyped-def]
+    """Add to `log` what the bins (n,) that one tap of an echo meets add to ℓ.
+
+    As if each count there gained the same logarithm.
+    """
     for d in range(log.size):
-        log[d] += fired[d] * log1p32(gain * per_more[d]) - photons * unfired[d]
+        log[d] += fired[d] * gained - photons * unfired[d]
+
+
+@njit(**COMPILED)
+def _correct_tap(gain, gained, fired, per_more, log):  # type: ignore[no-untyped-def]
+    """Replace `gained` by the logarithm that a count gains in each bin (n,)."""
+    for d in range(log.size):
+        log[d] += fired[d] * (log1p32(gain * per_more[d]) - gained)
 
 
 @njit(**COMPILED)
@@ -490,37 +518,31 @@ def _fill_further(i, counts, model, background, signal, delay, levels, weight, l
     if model.is_first:  # a count adds -μ to its logarithm
         for k in pixel.fired:
             exposure += pixel.counts[k] * model.background[k]
-    _fill_more(i, model, background[i], signal, delay, before)
-    for k in range(n_bins):
-        before[k] = 1.0 / before[k]
+    met = _met_bins(i, model, signal, delay)
+    alone_before = _fill_more(i, model, background[i], signal, delay, met, before)
     for level in range(len(levels)):
         s = levels[level, i]
         left = max(background[i] - s, 0.1 * background[i])
-        _fill_more(i, model, left, signal, delay, after)
-        base, ratio, gained = weight[level] + (background[i] - left) * exposure, 1.0, 0.0
-        for k in range(n_bins):
+        alone = _fill_more(i, model, left, signal, delay, met, after)
+        gained = math.log(alone / alone_before)
+        base = weight[level] + (background[i] - left) * exposure + pixel.n_photons * gained
+        for k in range(met[0], met[1]):
             per_more[k] = 1.0 / after[k]
-        for k in pixel.fired:
-            if after[k] * before[k] != ratio:  # mostly as before, and logarithms are slow
-                ratio = after[k] * before[k]
-                gained = math.log(ratio)
-            base += pixel.counts[k] * gained
-        for k in range(n_bins):
-            one[k] = base
+            if pixel.counts[k] > 0:
+                base += pixel.counts[k] * (math.log(after[k] / before[k]) - gained)
+        one[:] = base
         for tap in range(n_taps):
             photons = np.float32(s * model.echo[middle, tap])
             gain = np.float32(-math.expm1(-photons) if model.is_first else photons)
-            step = model.first_tap + tap
-            begin, end = max(0, -step), min(n_bins, n_bins - step)
+            gained, step = log1p32(gain * np.float32(1.0 / alone)), model.first_tap + tap
+            begin, end = max(0, step), min(n_bins, n_bins + step)
             if begin < end:
-                _add_tap(
-                    photons,
-                    gain,
-                    fired[begin + step : end + step],
-                    unfired[begin + step : end + step],
-                    per_more[begin + step : end + step],
-                    one[begin:end],
-                )
+                log_here = one[begin - step : end - step]
+                _add_tap(photons, gained, fired[begin:end], unfired[begin:end], log_here)
+            begin, end = max(begin, met[0]), min(end, met[1])
+            if begin < end:
+                log_here = one[begin - step : end - step]
+                _correct_tap(gain, gained, fired[begin:end], per_more[begin:end], log_here)
         _add_logarithms(one, log)
 
 
