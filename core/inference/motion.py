@@ -27,7 +27,7 @@ from core.inference.likelihood import LikelihoodInput, prepared_groups
 from core.inference.neighbours import box_sum
 from core.inference.posterior import vertex
 from core.kernels.blocks import lane_counts
-from core.kernels.motion import fill_moving_delays, fill_velocity_evidence
+from core.kernels.motion import AT_ONCE, fill_moving_delays, fill_velocity_evidence
 from core.kernels.parallel import on_threads
 from core.labels import Plane
 from core.pulse_groups import PulseGroups
@@ -165,7 +165,8 @@ def velocity_evidence(
     for pixels, prepared, counts in _parts(capture, groups, flux):
         lanes = counts.shape[3]
         found = np.empty((travel_bins.size, counts.shape[1], lanes))
-        given = prepared, counts, _exposure(capture, groups), displaced, tried_per_bin, found
+        exposure, margin = _exposure(capture, groups), _margin_bins(displaced)
+        given = prepared, counts, exposure, displaced, margin, tried_per_bin, found
         on_threads(fill_velocity_evidence, counts.shape[1], counts.size * travel_bins.size, *given)
         evidence[pixels] = found.reshape(travel_bins.size, -1).T[: pixels.stop - pixels.start]
     return evidence.reshape(*capture.shape, travel_bins.size)
@@ -365,6 +366,7 @@ def moving_surfaces(
             counts,
             _exposure(capture, groups),
             displaced,
+            _margin_bins(displaced),
             velocity.reshape(n_blocks, lanes),
             best,
             around,
@@ -434,9 +436,14 @@ def flux_at_rest(capture: Capture, groups: PulseGroups, travel_bins: Floats) -> 
 
 
 def _displacements(travel_bins: NDArray[Any], groups: PulseGroups) -> Floats:
-    """Displacement of each group in steps, shape (velocity, group)."""
-    moved = np.multiply.outer(travel_bins.astype(float), groups.middle * STEPS_PER_BIN)
-    return np.asarray(moved, float)
+    """Displacement of each group in steps, shape (velocity, group), completed as kernels need."""
+    middle = np.append(groups.middle, np.zeros(-len(groups.middle) % AT_ONCE))
+    return np.multiply.outer(travel_bins.astype(float), middle * STEPS_PER_BIN)
+
+
+def _margin_bins(displaced: Floats) -> int:
+    """Bins on either side of the gate that interpolated displacements in steps reach."""
+    return math.ceil(float(np.abs(displaced).max()) / STEPS_PER_BIN) + 1
 
 
 def _exposure(capture: Capture, groups: PulseGroups) -> Floats:

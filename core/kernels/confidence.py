@@ -184,7 +184,7 @@ def _fill_peaks(b, prepared, best, around):  # type: ignore[no-untyped-def]
         for j in range(3):
             d = min(max(at[i] + j - 1, 0), n_delays - 1)
             log = ratio[:, d % n_steps, d // n_steps]
-            around[i, j] = _log_sum(prepared.depth[d], log, offset, i)
+            around[i, j] = log_sum(prepared.depth[d], log, offset, i)
 
 
 @njit(**COMPILED)
@@ -200,7 +200,7 @@ def _fill_argmax(density, at):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _log_sum(factor, log, offset, i):  # type: ignore[no-untyped-def]
+def log_sum(factor, log, offset, i):  # type: ignore[no-untyped-def]
     """Return ``ln (factor Σ_level exp(log + offset))`` of a lane, from (level, lane) each."""
     most, total = -np.inf, 0.0
     for level in range(len(log)):
