@@ -214,6 +214,8 @@ class Pairs(NamedTuple):
     def agreement(self) -> Agreement:
         """Find how similar neighbours are; unrelated if pairs at random are half as similar."""
         best, chance = self.likeliest(), 0.0
+        if best.alike == 0:
+            return UNRELATED
         apart = self.nothing.shape[1] // 2  # pixels are in random order
         for ratio in self.ratios(apart):
             chance = max(chance, float(_likeliest_share(ratio)[1].mean()))
