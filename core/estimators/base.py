@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -21,9 +22,10 @@ from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
 from core.inference.motion import RadialVelocity
-from core.inference.neighbours import patches, pooled_at, pooled_in
+from core.inference.neighbours import Patch, patches, pooled_at, pooled_in
 from core.inference.posterior import tolerance_probability
 from core.inference.returns import Returns
+from core.kernels.parallel import each_on_threads
 from core.labels import Plane, images_dataset, software
 from core.notebook import html_table
 from core.parameters import Choice, Number
@@ -544,17 +546,21 @@ class Estimator:
         size = self.window_size(parameters)
         given = conditions_of(capture, flux, size)
         position, score = np.empty((2, *capture.shape))
+
+        def fill(patch: Patch, cube: NDArray[Any], rows: slice) -> None:
+            signal, background = given.signal[patch][rows], given.background[patch][rows]
+            some = given._replace(signal=signal, background=background)
+            curve = self.curve(cube[rows].astype(float), some, parameters)
+            position[patch][rows] = curve.argmax(axis=2)
+            score[patch][rows] = curve.max(axis=2)
+
         for patch in patches(capture.cube.shape, NUMBERS_AT_ONCE):
             cube = pooled_in(capture.cube, patch, size)
             # A few rows at a time, so that temporaries stay in the cache.
             rows_at_once = max(1, _IN_CACHE // cube[0].size)
-            for first in range(0, len(cube), rows_at_once):
-                rows = slice(first, first + rows_at_once)
-                signal, background = given.signal[patch][rows], given.background[patch][rows]
-                some = given._replace(signal=signal, background=background)
-                curve = self.curve(cube[rows].astype(float), some, parameters)
-                position[patch][rows] = curve.argmax(axis=2)
-                score[patch][rows] = curve.max(axis=2)
+            starts = range(0, len(cube), rows_at_once)
+            rows = [slice(first, first + rows_at_once) for first in starts]
+            each_on_threads(partial(fill, patch, cube), rows)
         return position, score
 
 

@@ -438,7 +438,7 @@ def flux_at_rest(capture: Capture, groups: PulseGroups, travel_bins: Floats) -> 
 def _displacements(travel_bins: NDArray[Any], groups: PulseGroups) -> Floats:
     """Displacement of each group in steps, shape (velocity, group), completed as kernels need."""
     middle = np.append(groups.middle, np.zeros(-len(groups.middle) % AT_ONCE))
-    return np.multiply.outer(travel_bins.astype(float), middle * STEPS_PER_BIN)
+    return np.asarray(np.multiply.outer(travel_bins.astype(float), middle * STEPS_PER_BIN))
 
 
 def _margin_bins(displaced: Floats) -> int:

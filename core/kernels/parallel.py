@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 def can_cache() -> bool:
@@ -66,10 +68,21 @@ def on_threads(kernel: Callable[..., None], n_blocks: int, work: int, *arguments
     if n_parts <= 1:
         kernel(0, n_blocks, *arguments)
         return
-    (first, end), *others = pairwise(n_blocks * part // n_parts for part in range(n_parts + 1))
-    running = [_threads().submit(kernel, *other, *arguments) for other in others]
+    ends = pairwise(n_blocks * part // n_parts for part in range(n_parts + 1))
+    each_on_threads(lambda part: kernel(*part, *arguments), list(ends))
+
+
+def each_on_threads(call: Callable[[T], object], items: Sequence[T]) -> None:
+    """Call a function that releases the GIL with each item, on the threads of kernels."""
+    n_threads = min(numba.get_num_threads(), len(items))
+
+    def call_each(some: Sequence[T]) -> None:
+        for item in some:
+            call(item)
+
+    running = [_threads().submit(call_each, items[i::n_threads]) for i in range(1, n_threads)]
     try:
-        kernel(first, end, *arguments)
+        call_each(items[::n_threads])
     finally:
         wait(running)
     for each in running:
