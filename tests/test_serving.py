@@ -213,19 +213,6 @@ def test_a_network_address_requires_an_origin(capsys):
     assert "--origin" in capsys.readouterr().err
 
 
-def test_the_printed_link_has_a_token_and_ctrl_c_stops():
-    with run("-m", "app", "--address", "0.0.0.0", "--origin", "127.0.0.1", "--port", "0") as server:
-        line = next(line for line in server.stdout if line.startswith("Open"))
-        link = re.search(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{20,})", line)
-        site = Site(f"http://127.0.0.1:{link[1]}/")
-        assert site.ask()[0] == 403
-        assert site.ask(f"/?token={link[2]}")[0] == 303
-        server.send_signal(signal.SIGINT)
-        rest = server.communicate(timeout=60)[0]
-    assert server.returncode == 0
-    assert "Traceback" not in rest
-
-
 FORKING = """
 import os, sys
 from app import __main__
@@ -261,14 +248,40 @@ def ended(forking):
     raise AssertionError("".join(printed))
 
 
+ON_A_NETWORK = """
+import os, sys
+import core
+from app.__main__ import main
+
+core.warm_up = lambda *_, **__: None
+print("process", os.getpid(), flush=True)
+sys.exit(main(["--address", "0.0.0.0", "--origin", "127.0.0.1", "--port", "0"]))
+"""
+
+
+def test_the_printed_link_has_a_token_and_ctrl_c_stops(forking):
+    begin(forking, ON_A_NETWORK)
+    _, process = next(forking.stdout).split()
+    line = next(line for line in forking.stdout if line.startswith("Open"))
+    link = re.search(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{20,})", line)
+    site = Site(f"http://127.0.0.1:{link[1]}/")
+    assert site.ask()[0] == 403
+    assert site.ask(f"/?token={link[2]}")[0] == 303
+    os.kill(int(process), signal.SIGINT)
+    printed, status = ended(forking)
+    assert status == 0
+    assert "Traceback" not in printed
+
+
 STOPPED_AT_A_BAD_MOMENT = """
 import os, signal, sys, time
 from contextlib import suppress
 from types import SimpleNamespace
+import core
 from app import __main__ as started
 from app.tasks.scheduler import Cancelled, LongWork
 
-def nothing(*_):
+def nothing(*_, **__):
     pass
 
 def long_work(progress):
@@ -289,6 +302,7 @@ def page_for(*_):
     LongWork(page, lambda: None, nothing).start_piece(long_work, nothing)
     Last()
 
+core.warm_up = nothing
 started.page_for = page_for
 sys.exit(started.main(["--port", "0"]))
 """
