@@ -131,8 +131,8 @@ def test_the_trade_off_leaves_out_slow_configurations(source, monkeypatch):
 
 def test_a_long_gate_is_not_processed_on_the_page(tmp_path):
     """It has few counts, but many delays."""
-    cube = np.ones((1, 1, 300_000), np.uint8)
-    capture = Capture(cube, Acquisition(300_000, 1e-9, n_pulses=10**6))
+    cube = np.ones((1, 1, 60_000), np.uint8)
+    capture = Capture(cube, Acquisition(60_000, 1e-9, n_pulses=10**6))
     save_capture(capture, tmp_path / "long.npz")
     answer = compute(ask(file_source(tmp_path / "long.npz")), None)
     again = replace(answer.request, tracking=TrackingParameters(t_n=50))
