@@ -886,7 +886,7 @@ def test_a_line_drawn_on_the_map_pins_its_ends_and_bends_for_a_profile(near):
 def test_the_likelihood_with_velocity_shows_velocities():
     session = Session({"approach": built_in_sources()["approach"]}, tasks=HeldTasks())
     assert VELOCITY not in session.state.param.map.objects
-    change(session, method="velocity", pixel=(32, 32))
+    change(session, method="velocity", pixel=(16, 16), reduction=ReductionSettings(skip=2))
     assert VELOCITY in session.state.param.map.objects
     session.state.map = VELOCITY
     answer = session.answer
@@ -895,7 +895,7 @@ def test_the_likelihood_with_velocity_shows_velocities():
     assert np.nanmedian(drawn) == pytest.approx(-20, rel=0.05)  # the scene's
     section = on_screen(PixelSection(session, "pixel"))
     velocity = answer.run.image.velocity
-    assert values(section.facts)["Velocity"] == velocity.text_at(32, 32).replace("-", "−")
+    assert values(section.facts)["Velocity"] == velocity.text_at(16, 16).replace("-", "−")
     change(session, method="likelihood")
     assert VELOCITY not in session.state.param.map.objects
     assert session.state.map == "Estimate"
