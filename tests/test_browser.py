@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from playwright.sync_api import Locator, Page, expect
+from scipy.io import loadmat, savemat
 
 import core
 from app.model.mesh import point_cloud
@@ -577,7 +578,7 @@ CHANGE_QUICKLY = (
   const themed = all.filter((data) => data?.attributes?.dark_theme === false);
   const wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
   let reverted = 0;
-  for (let pause_ms = 0; pause_ms < 20; pause_ms++) {
+  for (let pause_ms = 0; pause_ms < 20; pause_ms += 2) {
     for (const is_dark of [true, false]) {
       for (const data of themed)
         data.setv({ dark_theme: is_dark }, { sync: false });  // as for a message of the server
@@ -757,15 +758,18 @@ HIDE_AND_SHOW = f"""async () => {{
 
 
 COVERED = """
+window.was_covered = false;
 const look = () => {
+  if (window.looks_no_more) return;
   const seek = (root) => [...root.querySelectorAll("*")].some(
     (each) => each.matches(".MuiBackdrop-root") || (each.shadowRoot && seek(each.shadowRoot)),
   );
-  window.was_covered ||= seek(document);
+  was_covered ||= seek(document);
   requestAnimationFrame(look);
 };
 look();
 """
+"""JavaScript that walks through the page in every frame, until ``looks_no_more``."""
 
 
 FIRST_VISIT = f"delete localStorage['{TOUR}'];"
@@ -796,7 +800,7 @@ def take_the_tour(page: Page) -> None:
 
 def test_a_phone_shows_everything_stacked(page):
     new = page(width=390, height=844, prepare=COVERED + FIRST_VISIT)
-    assert not new.evaluate("was_covered")
+    assert new.evaluate("looks_no_more = true, was_covered") is False
     take_the_tour(new)
     new.keyboard.press("Escape")
     expect(new.get_by_role("region", name="Tour")).to_be_hidden()
@@ -826,11 +830,19 @@ def test_a_phone_shows_everything_stacked(page):
 # -- files -----------------------------------------------------------------------------------------
 
 
+def cropped(path: Path, folder: Path) -> Path:
+    """Write a tenth of a capture, pixels of the building, and return the path."""
+    content = {name: held for name, held in loadmat(path).items() if not name.startswith("_")}
+    content["Ts_gated"] = content["Ts_gated"][64:144, 150:230]
+    savemat(folder / path.name, content)
+    return folder / path.name
+
+
 def expect_the_building_at_21_km(page: Page) -> None:
     """Expect its estimate and what was guessed, and nothing that requires a truth."""
     source = page.get_by_text("21km_K11_night.mat, variable Ts_gated; guessed:")
     expect(source.filter(visible=True)).to_be_visible()
-    expect(page.get_by_text("256 × 256 pixels, 200 bins of 1 ns")).to_be_visible()
+    expect(page.get_by_text("80 × 80 pixels, 200 bins of 1 ns")).to_be_visible()
     for name in ("RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"):
         expect(fact(page, name)).to_have_count(0)
     expect(page.get_by_role("button", name="Truth", exact=True)).to_have_count(0)
@@ -840,7 +852,7 @@ def expect_the_building_at_21_km(page: Page) -> None:
 
 
 def test_files_are_ranged_inspected_read_again_or_refused(page, real_capture, tmp_path, troubles):
-    new, path = page(), real_capture("21km_K11_night.mat")
+    new, path = page(), cropped(real_capture("21km_K11_night.mat"), tmp_path)
     upload(new, path.name, path.read_bytes())
     inspect = new.get_by_role("button", name="Inspect", exact=True)
     expect(inspect).to_have_attribute("aria-pressed", "true")
@@ -853,8 +865,8 @@ def test_files_are_ranged_inspected_read_again_or_refused(page, real_capture, tm
     go(new, "Inspect")
     capture = core.read_capture(path)
     for name in ("Row", "Column"):  # the middle; written late, it would replace an entry
-        expect(field(new, name)).to_have_value(re.compile(r"^1\d\d$"))
-    subject = Subject(capture, ranged(capture), (100, 190))
+        expect(field(new, name)).to_have_value("40")
+    subject = Subject(capture, ranged(capture), (36, 40))
     expect_pixel(new, subject)
     eventually(lambda: is_mapped(new, subject.visible_m))
     go(new, "Explore")
@@ -863,7 +875,7 @@ def test_files_are_ranged_inspected_read_again_or_refused(page, real_capture, tm
     expect(bin_width).to_have_value("1 ns")  # a guess
     bin_width.fill("2000 ps")
     bin_width.press("Enter")
-    expect(new.get_by_text("256 × 256 pixels, 100 bins of 2 ns")).to_be_visible()
+    expect(new.get_by_text("80 × 80 pixels, 100 bins of 2 ns")).to_be_visible()
     expect(bin_width).to_have_value("2 ns")
     bin_width.fill("wide")
     new.get_by_role("button", name="Read again").click()
