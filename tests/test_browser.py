@@ -49,7 +49,7 @@ from tests.browser import (
     upload,
     warning,
 )
-from tests.test_inspect_browser import Subject, expect_pixel, is_mapped, ranged
+from tests.inspecting import Subject, expect_pixel, is_mapped, ranged
 
 pytestmark = pytest.mark.browser
 

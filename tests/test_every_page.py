@@ -7,6 +7,7 @@ from playwright.sync_api import Page, expect
 
 from app.pages.catalog import PAGES
 from tests.browser import EDGES, VIEWS, eventually, image, slider, stage
+from tests.inspecting import LINK, expect_a_steady_frame, inspect_the_building
 from tests.test_browser import (
     NOTE_FIRST,
     change_theme,
@@ -16,7 +17,6 @@ from tests.test_browser import (
     use_the_controls,
 )
 from tests.test_compare import compare_the_methods
-from tests.test_inspect_browser import expect_a_steady_frame, inspect_the_building
 from tests.test_lessons import take_lessons_of_every_kind
 from tests.test_paper_page import read_part_by_part
 from tests.test_tradeoff_page import open_a_configuration
@@ -151,7 +151,7 @@ JOURNEYS = {
 }
 """Actions of a user on a page that has just been opened, by its name."""
 
-OTHERWISE = {"Inspect": "&source=building&pixel=[30,20]"}
+OTHERWISE = {"Inspect": LINK}
 """Further parts of the address of a page, by its name."""
 
 

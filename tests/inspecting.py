@@ -12,7 +12,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pytest
 from playwright.sync_api import Locator, Page, expect
 
 import core
@@ -27,8 +26,6 @@ from tests.browser import image as picture
 from tests.test_downloads import columns_of, download
 from tests.test_lasting import here as address_of
 from tests.test_lasting import rests
-
-pytestmark = pytest.mark.browser
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +56,9 @@ def simulated_building() -> Subject:
     return Subject(capture, ranged(capture), (30, 20))
 
 
-LINK = "?source=building&page=Inspect&pixel=[30,20]"
+REGION_AND_PINS = "subject=Region&region=[[20,20],[20,40],[40,40],[40,20]]&pins=[[30,20],[30,21]]"
+LINK = f"&source=building&pixel=[30,20]&{REGION_AND_PINS}"
+"""Part of the address with which the page is opened."""
 
 
 # -- parts of the page -----------------------------------------------------------------------------
@@ -297,17 +296,6 @@ def expect_fewer_pulses(page: Page, capture: Capture) -> None:
     eventually(lambda: np.array_equal(drawn(page, "Counts of all pixels", "raw", "raw"), counts))
 
 
-def inspect_the_building(page: Page) -> None:
-    """Expect pixel, maps and report of the building, and fewer pulses on request."""
-    subject = simulated_building()
-    expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
-    expect_pixel(page, subject)
-    expect_maps(page, subject)
-    button(page, "Capture").click()
-    expect_report(page, subject.capture)
-    expect_fewer_pulses(page, subject.capture)
-
-
 # -- the pixel -------------------------------------------------------------------------------------
 
 
@@ -406,7 +394,7 @@ def expect_sum_of_dragged(page: Page, subject: Subject, mode: str) -> None:
 
 
 def drag_regions_and_a_line(page: Page, facade: Subject) -> None:
-    """Drag on the map; at last without the server."""
+    """Drag on the map."""
     for mode in DRAGS:
         expect_sum_of_dragged(page, facade, mode)
     clear_region(page)
@@ -414,8 +402,11 @@ def drag_regions_and_a_line(page: Page, facade: Subject) -> None:
     names = [", ".join(str(round(at)) for at in place_at(page, *end)) for end in ends]
     drag(page, "Line", *ends)
     expect(page.get_by_text(f"pixels from {names[0]} to {names[1]}, ")).to_be_visible()
+
+
+def drag_without_the_server(page: Page) -> None:
     page.evaluate("() => { WebSocket.prototype.send = () => {}; }")
-    for mode in TOOLS:  # without the server
+    for mode in TOOLS:
         choose_drag(page, mode)
 
 
@@ -464,9 +455,6 @@ def pin_pixels(page: Page, facade: Subject) -> None:
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
 
 
-REGION_AND_PINS = "&subject=Region&region=[[20,20],[20,40],[40,40],[40,20]]&pins=[[30,20],[30,21]]"
-
-
 def show_all_parts_below_each_other(page: Page) -> None:
     """Show the region and the pins of a link on a phone, and remove them."""
     expect(fact(page, "Pixels")).to_have_text("441")
@@ -502,12 +490,24 @@ def show_all_parts_below_each_other(page: Page) -> None:
     button(page, "Pixel").click()
 
 
-def test_a_link_opens_region_and_pins_and_others_are_chosen(page, address):
-    opened = page(f"{address}{LINK}{REGION_AND_PINS}", width=390, height=844)
-    show_all_parts_below_each_other(opened)
-    opened.set_viewport_size({"width": 1440, "height": 900})
-    opened.get_by_role("button", name="Open drawer").click()  # it stays closed in a wider window
-    facade = simulated_building()
-    pin_pixels(opened, facade)
-    move_the_pixel(opened, facade)
-    drag_regions_and_a_line(opened, facade)
+# -- all of it ------------------------------------------------------------------------------------
+
+
+def inspect_the_building(page: Page) -> None:
+    """Show what the link `LINK` names, choose others, and read the report of the building."""
+    building = simulated_building()
+    expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.keyboard.press("Escape")  # closes the sidebar, which covers the page
+    show_all_parts_below_each_other(page)
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.get_by_role("button", name="Open drawer").click()  # it stays closed in a wider window
+    expect_pixel(page, building)
+    expect_maps(page, building)
+    pin_pixels(page, building)
+    move_the_pixel(page, building)
+    drag_regions_and_a_line(page, building)
+    button(page, "Capture").click()
+    expect_report(page, building.capture)
+    expect_fewer_pulses(page, building.capture)
+    drag_without_the_server(page)
