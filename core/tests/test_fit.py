@@ -129,7 +129,9 @@ def test_p_values_depend_on_the_pixel_alone() -> None:
     assert fit_in(capture, some).pixels.effect == max(few / some.size - SIGNIFICANCE, 0.0)
 
 
-@pytest.mark.parametrize("n_bins", [1, 3, pytest.param(50, marks=pytest.mark.compiled)])
+@pytest.mark.parametrize(
+    "n_bins", [3, *(pytest.param(each, marks=pytest.mark.compiled) for each in (1, 50))]
+)
 @pytest.mark.parametrize("detection", ["first", "all"])
 def test_any_histogram_has_a_p_value(detection: Detection, n_bins: int) -> None:
     for count in (7,) if numba.config.DISABLE_JIT else (0, 1, 7):

@@ -61,7 +61,7 @@ def test_messages_give_the_exact_posterior_of_a_row(slope: float, along_rows: bo
 
 
 def test_planes_are_fitted_despite_outliers() -> None:
-    row, col = np.mgrid[:14, :30]
+    row, col = np.mgrid[:6, :60]
     delay = 20 + 1.5 * row - 0.25 * col
     rng = np.random.default_rng(0)
     outlier = rng.uniform(size=delay.shape) < 0.3
@@ -76,6 +76,7 @@ def test_planes_are_fitted_despite_outliers() -> None:
     assert right.sum() > 0.97 * (~outlier).sum()
 
 
+@pytest.mark.compiled
 def test_the_plane_of_a_pixel_beside_another_surface_is_that_of_its_own() -> None:
     row, col = np.mgrid[:20, :30]
     is_ground, is_post = row >= 10, (col >= 12) & (col < 16)
@@ -94,7 +95,7 @@ def test_the_plane_of_a_pixel_beside_another_surface_is_that_of_its_own() -> Non
 
 
 def test_each_pixel_takes_the_plane_that_suits_it_best() -> None:
-    rng, half, (rows, cols) = np.random.default_rng(1), 2, (7, 2 * LANES)
+    rng, half, (rows, cols) = np.random.default_rng(1), 2, (4, 2 * LANES)
     delay = rng.uniform(20, 40, (rows, cols)).astype(np.float32)
     windows = rng.normal(size=(4, rows, cols)).astype(np.float32)
     windows[0], windows[1] = rng.uniform(size=(rows, cols)), rng.uniform(20, 40, (rows, cols))

@@ -20,7 +20,7 @@ from core.estimators.unmixing import Clusters, UnmixingParameters
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
 from core.inference.neighbours import pooled
-from core.trigger import draw_counts, rate_per_bin, trigger_probability
+from core.trigger import rate_per_bin, trigger_probability
 
 ACQUISITION = Acquisition(n_pulses=1000)
 CONDITIONS = Conditions(ACQUISITION, Pulse(), 1000, np.array(0.1041), np.array(1.735), 0.06)
@@ -37,7 +37,10 @@ def rates(onset_bin: Any, sbr: float, pulse: Pulse = Pulse()) -> np.ndarray:
 
 def drawn(onset_bin: Any, sbr: float, seed: int, pulse: Pulse = Pulse()) -> np.ndarray:
     """Counts of such pixels."""
-    return draw_counts(rates(onset_bin, sbr, pulse), 1000, np.random.default_rng(seed))
+    chance = trigger_probability(rates(onset_bin, sbr, pulse))
+    none = 1 - chance.sum(axis=-1, keepdims=True)
+    rng = np.random.default_rng(seed)
+    return rng.multinomial(1000, np.concatenate([chance, none], axis=-1))[..., :-1]
 
 
 def flux_model_of(shape: tuple[int, int], sbr: float) -> FluxModel:
@@ -367,6 +370,7 @@ def test_nothing_near_a_smoothed_image_is_better() -> None:
             assert energy(found + RNG.normal(0, size, y.shape), y, w, 1.0) > least
 
 
+@pytest.mark.compiled
 def test_a_surface_is_unmixed_where_single_pixels_are_lost() -> None:
     onset = np.full((16, 16), 53.6)
     cube = drawn(onset, 0.03, seed=6)

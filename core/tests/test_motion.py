@@ -17,6 +17,7 @@ from core.capture import Capture, Detection
 from core.effects import Motion
 from core.estimators import estimate
 from core.inference import flux_model_of
+from core.inference.flux_model import FluxPrior
 from core.inference.motion import flux_at_rest, shared_velocity, velocity_evidence
 from core.io import save_capture
 from core.io.readers import read_capture
@@ -102,7 +103,11 @@ def ratio(capture: Capture, level: int, delay: float, travel_bins: float) -> flo
 
 
 def test_evidence_of_a_velocity_is_that_of_the_equation() -> None:
-    capture = drawn(moving(flat(14.0, side=1), 40.0, 60), 0.5, 6, seed=2)
+    levels, share = np.array([0.0, 0.1, 0.5]), np.array([0.2, 0.5, 0.3])
+    # Given, since plain Python takes seconds to estimate it.
+    known = FluxPrior(levels, share, np.ones(GATE.n_bins), np.asarray(0.2), 0.8)
+    capture = drawn(moving(flat(14.0, side=1), 40.0, 60), 0.5, 3, seed=2)
+    capture = replace(capture, flux_prior=known)
     groups, flux = capture.groups, flux_model_of(capture)
     assert groups is not None
     travel = np.array([0, 6, -12])  # whole steps in every group: nothing is interpolated
@@ -311,6 +316,7 @@ def test_groups_that_do_not_add_up_are_refused() -> None:
         group_sizes(60, 61)
 
 
+@pytest.mark.files
 def test_files_keep_groups_or_refuse_them(tmp_path: Path) -> None:
     capture = drawn(moving(flat(12.0), 30.0, 60), 0.5, 6)
     save_capture(capture, tmp_path / "a.npz")
@@ -346,6 +352,7 @@ def test_frames_are_kept_in_groups_on_request(
         read_capture(tmp_path / "f.npy", **options, pulse_rate_hz=2e4)
 
 
+@pytest.mark.files
 def test_a_sequence_of_files_is_kept_in_groups(tmp_path: Path) -> None:
     for n in range(5):
         save_capture(drawn(flat(12.0), 0.5, None, seed=n), tmp_path / f"r_{n}.npz")

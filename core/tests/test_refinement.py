@@ -30,7 +30,7 @@ from core.tracking import PRESETS, tracking_signals
 from core.tracking_parameters import Refine
 from core.trigger import draw_counts, rate_per_bin
 
-N_BINS = 40
+N_BINS, COLS = 40, 10
 
 PULSES = {
     "gamma": Pulse(1e-9),
@@ -42,10 +42,10 @@ PULSES = {
 def drawn(pulse: Pulse, n_pulses: int | None, rows: int = 3) -> Capture:
     """Draw pixels with echoes anywhere in the gate, brighter in later rows, and backgrounds."""
     acquisition, rng = Acquisition(n_bins=N_BINS, n_pulses=n_pulses), np.random.default_rng(2)
-    onset = rng.uniform(0, N_BINS, (rows, 30))
+    onset = rng.uniform(0, N_BINS, (rows, COLS))
     signal = np.broadcast_to(np.geomspace(0.2, 2.0, rows)[:, np.newaxis], onset.shape)
     rate = rate_per_bin(onset, signal, 0.0, pulse, acquisition)
-    rate += np.linspace(0.2, 1.0, 30)[:, np.newaxis] / N_BINS
+    rate += np.linspace(0.2, 1.0, COLS)[:, np.newaxis] / N_BINS
     photons = 1.0 if n_pulses else 300.0
     levels = photons * np.array([0.0, 0.3, 1.5])
     # Given, since plain Python takes seconds to estimate it.
@@ -160,7 +160,7 @@ def test_delays_move_to_the_largest_likelihood(pulse: str, n_pulses: int | None)
     np.testing.assert_array_equal(start, before)
     assert math.isnan(found[0, 2])
     sharpened = []
-    for row, col in [(0, 0), (0, 1), *((r, c) for r in range(3) for c in range(4, 30, 5))]:
+    for row, col in [(0, 0), (0, 1), *((r, c) for r in range(3) for c in range(4, COLS, 2))]:
         expected, is_sharp = twin(capture, row, col, start[row, col])
         assert found[row, col] == pytest.approx(expected, abs=1e-6)
         sharpened.append(is_sharp)

@@ -29,13 +29,24 @@ from core.tracking import (
 )
 
 # Half a millisecond a pixel where the kernels are plain Python.
-PIXELS = LANES if numba.config.DISABLE_JIT else 64 * LANES
+PIXELS = 16 if numba.config.DISABLE_JIT else 64 * LANES
 N_PULSES = 1000
 EPS_32 = float(np.finfo(np.float32).eps)
 
 Variant = tuple[Any, Any, Any]
 VARIANTS = list(product(get_args(Weight), get_args(Start), get_args(SigmaFrom)))
-WEIGHTS = [variant for variant in VARIANTS if variant[1] == "mean"]
+IN_PLAIN_PYTHON = VARIANTS[::5]  # each option of each choice once
+any_variant = pytest.mark.parametrize(
+    "variant",
+    [
+        pytest.param(
+            each,
+            id=" ".join(each),
+            marks=() if each in IN_PLAIN_PYTHON else pytest.mark.compiled,
+        )
+        for each in VARIANTS
+    ],
+)
 
 
 def settings_of(variant: Variant, **more: Any) -> TrackingParameters:
@@ -146,7 +157,7 @@ def assert_equals_twin(s: np.ndarray, p: TrackingParameters, tolerance: float) -
         assert at >= max(expected.enhanced) - 2 * top * unit
 
 
-@pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
+@any_variant
 def test_signals_are_the_equations(cube: np.ndarray, variant: Variant) -> None:
     for settings in (
         settings_of(variant),
@@ -215,14 +226,14 @@ CHANGED: list[dict[str, Any]] = [
 SETTINGS = PRESETS | {str(changed): TrackingParameters(**changed) for changed in CHANGED}
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        *(pytest.param(settings_of(variant), id=" ".join(variant)) for variant in VARIANTS),
-        *(pytest.param(of, id=name, marks=pytest.mark.compiled) for name, of in SETTINGS.items()),
-    ],
-)
-def test_track_finds_the_positions_of_the_signals(
+@any_variant
+def test_track_finds_the_positions_of_the_signals(cube: np.ndarray, variant: Variant) -> None:
+    assert_track_agrees(cube, settings_of(variant))
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_track_finds_the_positions_with_any_settings(
     cube: np.ndarray, settings: TrackingParameters
 ) -> None:
     assert_track_agrees(cube, settings)
@@ -335,7 +346,7 @@ def test_survival_weight_without_pulses_is_refused() -> None:
 
 
 @pytest.mark.uncounted
-@pytest.mark.parametrize("variant", WEIGHTS, ids=" ".join)
+@any_variant
 def test_no_position_lies_before_t_n(variant: Variant) -> None:
     rows = random_rows(n_bins=40)
     rows[:, 3] = 500
@@ -351,7 +362,7 @@ def test_no_position_lies_before_t_n(variant: Variant) -> None:
 
 
 @pytest.mark.uncounted
-@pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
+@any_variant
 def test_a_histogram_without_change_has_no_echo(variant: Variant) -> None:
     for n_bins in (1, 2, 40):
         rows = np.repeat([[0], [1], [60_000]], n_bins, axis=1).astype(np.uint16)
@@ -365,7 +376,7 @@ def test_a_histogram_without_change_has_no_echo(variant: Variant) -> None:
 
 
 @pytest.mark.uncounted
-@pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
+@any_variant
 def test_gates_of_few_bins_have_defined_positions(variant: Variant) -> None:
     settings = settings_of(
         variant, t_n=0 if settings_of(variant).sigma_from == "gate" else 1, l=0.1
