@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -384,35 +385,38 @@ def many_links(file: h5py.File) -> None:
 LARGE_TRUTH = {"data": np.zeros((2000, 2000), np.uint8), "compression": "gzip"}
 COORDINATES = {f"c{k}": ("bin", np.arange(100.0)) for k in range(101)}
 
-HDF5_REFUSED: tuple[tuple[bytes, str], ...] = (
-    (bytes(5000), "file cannot be read"),
-    (hdf5_bytes(), "variable = None .*has nothing"),
-    (hdf5_bytes(counts=CUBE[0]), "axes of counts = 2"),
-    (hdf5_bytes(counts=CUBE[:0]), r"counts = .*\(0, 4, 100\)"),
-    (hdf5_bytes(counts=CUBE * 1j), "counts = 'no numbers'"),
-    (hdf5_bytes(counts=np.zeros((3, 4, 5), [("a", "u2")])), "counts = 'no numbers'"),
-    (written(ragged), "counts = 'no numbers'"),
-    (written(virtual), "counts = 'a virtual array'"),
-    (written(external), "counts = 'an array kept in other files'"),
-    (written(linked), "counts = 'a link'"),
-    (written(huge_chunk), "a chunk of counts = 3000000000 "),
-    (written(wrong_checksum), "counts cannot be read"),
-    (known(_FillValue=np.uint16(3)), "_FillValue of counts = 3.0 .*without gaps"),
-    (known(missing_value=np.uint16(3)), "missing_value of counts = 3.0"),
-    (known(scale_factor=0.5), "scale_factor of counts = 0.5"),
-    (hdf5_bytes(counts=CUBE, truth_range_m=LARGE_TRUTH), r"truth_range_m = .*\(2000, 2000\)"),
-    (written(uneven), "steps of time_s"),
-    (known(pulse_tau_s="long"), "pulse_tau_s = 'long'"),
-    (known(detection="some"), "detection = 'some'"),
-    (netcdf_bytes(bare().assign_coords(COORDINATES)), "coordinates = 101"),
-    (written(many_links), "arrays of the file = 10001 .*10,000"),
-    (written(long_attributes), "attributes = too many"),
+HDF5_REFUSED: tuple[tuple[Callable[[], bytes], str], ...] = (
+    (lambda: bytes(5000), "file cannot be read"),
+    (hdf5_bytes, "variable = None .*has nothing"),
+    (lambda: hdf5_bytes(counts=CUBE[0]), "axes of counts = 2"),
+    (lambda: hdf5_bytes(counts=CUBE[:0]), r"counts = .*\(0, 4, 100\)"),
+    (lambda: hdf5_bytes(counts=CUBE * 1j), "counts = 'no numbers'"),
+    (lambda: hdf5_bytes(counts=np.zeros((3, 4, 5), [("a", "u2")])), "counts = 'no numbers'"),
+    (lambda: written(ragged), "counts = 'no numbers'"),
+    (lambda: written(virtual), "counts = 'a virtual array'"),
+    (lambda: written(external), "counts = 'an array kept in other files'"),
+    (lambda: written(linked), "counts = 'a link'"),
+    (lambda: written(huge_chunk), "a chunk of counts = 3000000000 "),
+    (lambda: written(wrong_checksum), "counts cannot be read"),
+    (lambda: known(_FillValue=np.uint16(3)), "_FillValue of counts = 3.0 .*without gaps"),
+    (lambda: known(missing_value=np.uint16(3)), "missing_value of counts = 3.0"),
+    (lambda: known(scale_factor=0.5), "scale_factor of counts = 0.5"),
+    (
+        lambda: hdf5_bytes(counts=CUBE, truth_range_m=LARGE_TRUTH),
+        r"truth_range_m = .*\(2000, 2000\)",
+    ),
+    (lambda: written(uneven), "steps of time_s"),
+    (lambda: known(pulse_tau_s="long"), "pulse_tau_s = 'long'"),
+    (lambda: known(detection="some"), "detection = 'some'"),
+    (lambda: netcdf_bytes(bare().assign_coords(COORDINATES)), "coordinates = 101"),
+    (lambda: written(many_links), "arrays of the file = 10001 .*10,000"),
+    (lambda: written(long_attributes), "attributes = too many"),
 )
 
 
 @pytest.mark.parametrize(("content", "message"), HDF5_REFUSED, ids=[m for _, m in HDF5_REFUSED])
-def test_hdf5_refused(content: bytes, message: str, tmp_path: Path) -> None:
-    path = put(tmp_path / "a.h5", content)
+def test_hdf5_refused(content: Callable[[], bytes], message: str, tmp_path: Path) -> None:
+    path = put(tmp_path / "a.h5", content())
     assert_refused(read_capture, path, message, CaptureError, 2**22)
 
 
@@ -450,19 +454,20 @@ def test_external_data_is_never_opened(tmp_path: Path) -> None:
             read_capture(path, variable=name)
 
 
-FILES_2 = zarr_files(bare(), 2, chunks=(2, 3, 64))
-FILES_3 = zarr_files(bare(), 3, chunks=(2, 3, 64))
+@cache
+def chunked(version: int) -> dict[str, bytes]:
+    return zarr_files(bare(), version, chunks=(2, 3, 64))
 
 
 def in_2(**changes: Any) -> dict[str, bytes]:
     """Files of version 2 with changed metadata."""
     name = "counts/.zarray"
-    return FILES_2 | {name: json.dumps(json.loads(FILES_2[name]) | changes).encode()}
+    return chunked(2) | {name: json.dumps(json.loads(chunked(2)[name]) | changes).encode()}
 
 
 def in_3(**changes: Any) -> dict[str, bytes]:
     name = "counts/zarr.json"
-    return FILES_3 | {name: json.dumps(json.loads(FILES_3[name]) | changes).encode()}
+    return chunked(3) | {name: json.dumps(json.loads(chunked(3)[name]) | changes).encode()}
 
 
 def first_chunk(data: bytes, compressor: Any) -> dict[str, bytes]:
@@ -475,31 +480,36 @@ SHORT_BLOSC = numcodecs.Blosc().encode(bytes(2 * 3 * 64 * 2))[:-2]
 BLOSC = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1, "blocksize": 0}
 BOMB = zlib.compress(bytes(2**24))
 
-ZARR_REFUSED: tuple[tuple[dict[str, bytes], str], ...] = (
-    ({"zarr.json": b'{"zarr_format": 3, "node_type": "group"}'}, "arrays = 0"),
-    (FILES_3 | {"counts/zarr.json": b"{"}, "variable counts = 'JSONDecodeError"),
-    (FILES_3 | {"counts/zarr.json": b"[" * 100_000}, "variable counts = 'RecursionError"),
-    (FILES_3 | {"counts/.zarray": b"{}"}, "versions 2 and 3"),
-    (in_3(zarr_format=4), "variable counts"),
-    (in_2(dtype="|O", filters=PICKLE), "variable counts"),
-    (in_2(filters=PICKLE), "'pickle'"),
-    (in_2(dtype="<c16"), "no numbers"),
-    (in_3(chunk_key_encoding=LEAVING), "variable counts"),
-    (in_2(dimension_separator="../"), "variable counts"),
-    (in_2(chunks=[10**4] * 3), "a chunk of counts = 2000000000000"),
-    (in_2(chunks=[512] * 3), "bytes of a chunk of counts = 268435456 .*16,777,216"),
-    (zarr_files(bare(), 2, _FillValue=3), "_FillValue of counts = 3.0"),
-    (in_2(shape=[10**5] * 3, chunks=[1000] * 3), "bytes of counts = 2000"),
-    (in_2(shape=[10**5] * 3), "chunks of counts = "),
-    (first_chunk(b"", None), "counts cannot be read"),
-    (first_chunk(BOMB, {"id": "zlib", "level": 1}), "counts cannot be read"),
-    (first_chunk(SHORT_BLOSC, BLOSC), "counts cannot be read.*Blosc"),
+ZARR_REFUSED: tuple[tuple[Callable[[], dict[str, bytes]], str], ...] = (
+    (lambda: {"zarr.json": b'{"zarr_format": 3, "node_type": "group"}'}, "arrays = 0"),
+    (lambda: chunked(3) | {"counts/zarr.json": b"{"}, "variable counts = 'JSONDecodeError"),
+    (
+        lambda: chunked(3) | {"counts/zarr.json": b"[" * 100_000},
+        "variable counts = 'RecursionError",
+    ),
+    (lambda: chunked(3) | {"counts/.zarray": b"{}"}, "versions 2 and 3"),
+    (lambda: in_3(zarr_format=4), "variable counts"),
+    (lambda: in_2(dtype="|O", filters=PICKLE), "variable counts"),
+    (lambda: in_2(filters=PICKLE), "'pickle'"),
+    (lambda: in_2(dtype="<c16"), "no numbers"),
+    (lambda: in_3(chunk_key_encoding=LEAVING), "variable counts"),
+    (lambda: in_2(dimension_separator="../"), "variable counts"),
+    (lambda: in_2(chunks=[10**4] * 3), "a chunk of counts = 2000000000000"),
+    (lambda: in_2(chunks=[512] * 3), "bytes of a chunk of counts = 268435456 .*16,777,216"),
+    (lambda: zarr_files(bare(), 2, _FillValue=3), "_FillValue of counts = 3.0"),
+    (lambda: in_2(shape=[10**5] * 3, chunks=[1000] * 3), "bytes of counts = 2000"),
+    (lambda: in_2(shape=[10**5] * 3), "chunks of counts = "),
+    (lambda: first_chunk(b"", None), "counts cannot be read"),
+    (lambda: first_chunk(BOMB, {"id": "zlib", "level": 1}), "counts cannot be read"),
+    (lambda: first_chunk(SHORT_BLOSC, BLOSC), "counts cannot be read.*Blosc"),
 )
 
 
 @pytest.mark.parametrize(("content", "message"), ZARR_REFUSED, ids=[m for _, m in ZARR_REFUSED])
-def test_zarr_refused(content: dict[str, bytes], message: str, tmp_path: Path) -> None:
-    path = put(tmp_path / "a.zarr", content)
+def test_zarr_refused(
+    content: Callable[[], dict[str, bytes]], message: str, tmp_path: Path
+) -> None:
+    path = put(tmp_path / "a.zarr", content())
     assert_refused(read_capture, path, message, CaptureError, 2**22)
 
 
@@ -508,7 +518,7 @@ def test_zarr_refused(content: dict[str, bytes], message: str, tmp_path: Path) -
 def test_zarr_holds_no_links_and_no_pipes(
     make: Callable[[Path], Any], place: str, tmp_path: Path
 ) -> None:
-    files = {name: content for name, content in FILES_2.items() if name != place}
+    files = {name: content for name, content in chunked(2).items() if name != place}
     path = put(tmp_path / "a.zarr", files)
     make(path / place)
     message = rf"a file of the directory = '{place}' .*no links"
