@@ -56,11 +56,11 @@ def empty(*shape: int) -> Capture:
 @pytest.mark.parametrize(
     ("method", "shape"),
     [
-        ("tracking", (1, 1, 200_000)),
-        ("likelihood", (1, 1, 200_000)),
-        ("kde", (24, 24, 5_000)),
-        ("tracking", (1000, 1000, 1)),
-        ("unmixing", (300, 300, 4)),
+        ("tracking", (1, 1, 100_000)),
+        ("likelihood", (1, 1, 100_000)),
+        ("kde", (24, 24, 2_000)),
+        ("tracking", (500, 500, 1)),
+        ("unmixing", (200, 200, 4)),
     ],
 )
 def test_predicted_memory_is_measured(

@@ -178,6 +178,7 @@ def test_numbers_are_those_of_the_reports(source: str, page: Page, image: core.R
     assert page.values["Restoration degree, 3 bins"] == list(astuple(known))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_tiny_probability_is_shown_as_a_bound() -> None:
     capture = simulated(n_pulses=20_000)  # so many that noise is hardly ever the surface
     image = core.estimate(capture, "tracking")
@@ -211,6 +212,7 @@ def test_the_cloud_has_the_confident_estimates(page: Page, image: core.RangeImag
     assert (f"{hidden:,} are hidden" in caption) == (hidden > 0)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_capture_without_photons_has_a_report() -> None:
     dark = core.Capture(np.zeros((3, 4, 30), np.uint8), core.Acquisition(30, 1e-9, 0.0, 100))
     page = Page(written(dark, core.estimate(dark, "likelihood")))
@@ -221,6 +223,7 @@ def test_a_capture_without_photons_has_a_report() -> None:
     assert "Pixel in row 1, column 2" in page.texts["h2"]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_ratio_without_an_upper_end_is_shown_by_its_lower_one() -> None:
     cube = np.zeros((2, 3, 40), np.uint8)
     cube[..., 20] = 9  # no background
