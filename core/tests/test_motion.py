@@ -38,6 +38,11 @@ def moving(scene: Scene, per_1000_bins: float, n_pulses: int = 1000) -> Scene:
     return replace(scene, motion=Motion(speed_m_per_s, RATE_HZ), acquisition=acquisition)
 
 
+def thinned(scene: Scene) -> Scene:
+    """Return a scene with every second row and column."""
+    return replace(scene, range_m=scene.range_m[::2, ::2])
+
+
 def drawn(scene: Scene, sbr: float, n_groups: int | None = 40, seed: int = 0) -> Capture:
     return simulate(scene, scene.acquisition, Flux(sbr=sbr), seed=seed, n_groups=n_groups)
 
@@ -144,13 +149,13 @@ def test_at_rest_it_is_the_likelihood() -> None:
 @pytest.mark.compiled
 @pytest.mark.parametrize("per_1000_bins", [10.0, -20.0])
 def test_shared_velocity_restores_a_moving_scene(per_1000_bins: float) -> None:
-    capture = drawn(moving(scenes["car"](), per_1000_bins), 0.05, seed=900)
+    capture = drawn(moving(thinned(scenes["car"]()), per_1000_bins), 0.05, seed=900)
     truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
     target = np.isfinite(truth_bin)
     found, still = estimate(capture, "velocity"), estimate(capture, "likelihood")
     right, before = ((np.abs(each.bin - truth_bin)[target] <= 3).mean() for each in (found, still))
     assert right > 0.95
-    assert before < 0.7
+    assert before < 0.75  # 0.7 of all pixels, and three standard deviations of a quarter of them
     velocity = found.velocity
     assert velocity is not None
     error = (velocity.bins - per_1000_bins)[target]
@@ -391,6 +396,9 @@ def test_the_study_compares_methods_that_know_less_and_more(
 ) -> None:
     for name, value in (("SPEEDS", (10.0,)), ("SBRS", (0.06,)), ("STILL", ("wall",))):
         monkeypatch.setattr(study, name, value)
+    for name in ("car", "wall"):
+        full = scenes[name]
+        monkeypatch.setitem(scenes, name, lambda full=full, **given: thinned(full(**given)))
     moving, still, velocity = study.tables(range(2))
     restored = {row[0]: row[1].value for row in moving.rows}
     assert restored["likelihood, at rest"] < 0.8
