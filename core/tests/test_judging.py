@@ -133,6 +133,7 @@ def test_a_table_compares_both_confidences() -> None:
 
 
 @compiled
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_line_takes_the_judge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,11 @@ FILES: dict[str, Callable[[], Content]] = {
 }
 
 
+@cache
+def content(name: str) -> Content:
+    return FILES[name]()
+
+
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of a chunk or so, as those of a large capture are."""
@@ -55,7 +61,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def opened(tmp_path: Path, small_blocks: None) -> xr.DataArray:
-    return open_capture(put(tmp_path / "c.zarr", FILES["two.zarr"]()))
+    return open_capture(put(tmp_path / "c.zarr", content("two.zarr")))
 
 
 # -- geometry --------------------------------------------------------------------------------------
@@ -108,7 +114,7 @@ def test_a_window_beyond_the_image_is_refused(window: Window) -> None:
 def test_a_window_holds_its_pixels_and_reads_few_others(
     name: str, window: Window, tmp_path: Path, small_blocks: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    counts = open_capture(put(tmp_path / name, FILES[name]()))
+    counts = open_capture(put(tmp_path / name, content(name)))
     prior, reads = flux_prior_of(CAPTURE), Reads(monkeypatch)
     found = read_window(counts, window, flux_prior=prior)
     rows, cols = window.picked
@@ -180,7 +186,7 @@ def test_pixels_not_read_yet_do_not_affect_the_flux_prior(opened: xr.DataArray) 
 def test_a_damaged_chunk_is_reported_and_can_be_read_again(
     tmp_path: Path, small_blocks: None
 ) -> None:
-    path = put(tmp_path / "c.zarr", FILES["two.zarr"]())
+    path = put(tmp_path / "c.zarr", content("two.zarr"))
     reader = WindowReader(open_capture(path), Window((0, 96), (0, 96), 4))
     chunk = path / "counts" / "0.0.0"
     whole = chunk.read_bytes()
