@@ -138,7 +138,7 @@ def test_the_parts_of_a_scene_are_judged_by_their_effect() -> None:
 @pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_pile_up_needs_a_correction_by_day_and_none_by_night() -> None:
-    day, night = (requirements(wall(), flux, seeds=range(3))[0] for flux in (DAY, NIGHT))
+    day, night = (requirements(wall(), flux, seeds=range(2))[0] for flux in (DAY, NIGHT))
     assert day.verdict == "needed"
     assert day.rd_change.low > 0.1
     assert day.total_variation > day.resolvable
@@ -270,7 +270,7 @@ def verdicts(capture: Capture) -> dict[str, str]:
 @pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_a_capture_with_echoes_alone_needs_no_parts() -> None:
-    found = verdicts(replace(seen(Flux(0.1, 2.0), size=64), truth_range_m=None, signal=None))
+    found = verdicts(replace(seen(Flux(0.1, 2.0)), truth_range_m=None, signal=None))
     assert set(found.values()) == {"not needed"}
 
 
