@@ -122,7 +122,8 @@ def endless(chunk: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        chunk.open("wb").close()  # readers see the end of the file
+        # Readers see the end of the file; without any, `O_WRONLY` would wait for one for ever.
+        os.close(os.open(chunk, os.O_RDWR))
         chunk.unlink()
         chunk.write_bytes(kept)
 
