@@ -16,10 +16,11 @@ from core import Acquisition, Capture, Flux, Pulse, Scene, simulate
 from core.effects import SecondSurface
 from core.inference import FALSE_RETURN
 from core.inference.returns import fitted_echoes
+from core.kernels.returns import EchoModel, fill_further
 from core.scene import net
 from core.trigger import draw_counts, rate_per_bin
 
-compiled = pytest.mark.compiled  # all but the test that compares the kernel with its definition
+compiled = pytest.mark.compiled  # all but the tests that compare kernels with their definitions
 
 GATE = Acquisition(100, 1e-9, 280e-9, n_pulses=1000)
 _TIME = np.arange(40)
@@ -142,6 +143,50 @@ def test_few_pixels_with_one_surface_get_a_second_return(kind: str) -> None:
     assert asked is not None
     more = np.count_nonzero(asked.count(capture.shape) > 1)
     assert binom.ppf(0.0001, n, 0.07) <= more <= binom.ppf(0.999, n, 0.1)
+
+
+def log_probability_of(counts: np.ndarray, rate: np.ndarray, n_pulses: int) -> float:
+    """Log likelihood of counts (bin,), of first photons unless there are no pulses."""
+    if n_pulses == 0:
+        return float(counts @ np.log(rate) - rate.sum())
+    unfired = n_pulses - np.cumsum(counts)
+    return float(counts @ np.log(-np.expm1(-rate)) - unfired @ rate)
+
+
+@pytest.mark.parametrize("n_pulses", [0, 200])
+@pytest.mark.parametrize("slope", [0.0, 0.5])
+def test_one_more_echo_has_the_likelihood_of_its_definition(n_pulses: int, slope: float) -> None:
+    rng, n_bins, first_tap = np.random.default_rng(3), 20, -1
+    echo = rng.dirichlet(np.ones(5), 3)  # shares of the bins at three delays within one
+    shape = 1 + slope * np.linspace(-1, 1, n_bins)
+    model = EchoModel(
+        echo, first_tap, shape / n_bins, slope == 0, n_pulses > 0, float(n_pulses or 1), 1.0
+    )
+    background, levels, weight = 0.9, np.array([[0.2], [1.5]]), np.log([0.3, 0.2])
+
+    def placed(at: int) -> np.ndarray:
+        whole = np.zeros(n_bins + 10)
+        whole[at + first_tap + 5 : at + first_tap + 10] = echo[1]
+        return whole[5:-5]
+
+    for known, at in ((0.0, 8), (0.6, 8), (0.6, 19), (0.6, 0)):
+        counts = rng.integers(0, 4, (1, n_bins)).astype(np.uint32)
+        given = np.array([[known]]), np.array([[at + 0.5]]), levels, weight
+        log = np.empty((1, n_bins), np.float32)
+        fill_further(0, 1, counts, model, np.array([background]), *given, log)
+        rest = known * placed(at)
+        before = log_probability_of(counts[0], background * model.background + rest, n_pulses)
+        for k in range(n_bins):
+            after = [
+                weight[i]
+                + log_probability_of(
+                    counts[0],
+                    max(background - s, 0.1 * background) * model.background + rest + s * placed(k),
+                    n_pulses,
+                )
+                for i, s in enumerate(levels[:, 0])
+            ]
+            assert log[0, k] == pytest.approx(np.logaddexp.reduce(after) - before, abs=1e-4)
 
 
 @compiled
