@@ -618,6 +618,7 @@ def test_bright_echoes_have_the_length_of_their_pulse() -> None:
     report = inspection.capture_report(capture)
     assert report.flux.signal.low < 0.3 < report.flux.signal.high
     assert "fit" not in report.flux_remark
+    assert "background is" not in report.flux_remark  # a uniform one is not worth a remark
 
 
 def test_flux_depends_neither_on_the_pulse_nor_on_the_bins() -> None:
