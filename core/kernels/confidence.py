@@ -178,7 +178,7 @@ def _fill_peaks(b, prepared, best, around):  # type: ignore[no-untyped-def]
     top, offset = np.empty(lanes), np.empty((n_levels, lanes))
     _fill_density(b, prepared, ratio, offset, density, top)
     at = np.empty(lanes, np.int32)
-    _fill_argmax(density, at)
+    fill_argmax(density, at)
     for i in range(lanes):
         best[i] = at[i]
         for j in range(3):
@@ -188,7 +188,7 @@ def _fill_peaks(b, prepared, best, around):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _fill_argmax(density, at):  # type: ignore[no-untyped-def]
+def fill_argmax(density, at):  # type: ignore[no-untyped-def]
     """Fill `at` (lane,) with the first row of the maximum of `density` (row, lane)."""
     highest = np.full(at.size, -1.0, np.float32)
     at[:] = 0

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from core.kernels.blocks import lane_rows
-from core.kernels.confidence import add_level, fill_highest, log_sum
+from core.kernels.confidence import add_level, fill_argmax, fill_highest, log_sum
 from core.kernels.elementary import exp32
 from core.kernels.parallel import COMPILED
 from core.kernels.posterior import correlate, counts_of, fill_flat, fill_log_gain
@@ -226,11 +226,12 @@ def fill_moving_delays(  # type: ignore[no-untyped-def]
             fill_flat(b, level + 1, prepared, all_fired, all_unfired, offset[level])
             offset[level] += prepared.log_share[level + 1]
             add_level(ratio[level], offset[level], density, top)
+        at = np.empty(lanes, np.int32)
+        fill_argmax(density, at)
         for i in range(lanes):
-            at = density[:, i].argmax()
-            best[b, i] = at
+            best[b, i] = at[i]
             for j in range(3):
-                d = min(max(at + j - 1, 0), n_delays - 1)
+                d = min(max(at[i] + j - 1, 0), n_delays - 1)
                 log = ratio[:, d % n_steps, d // n_steps]
                 around[b, i, j] = log_sum(1.0, log, offset, i)
             unit = max(top[i], none)  # so that neither overflows
