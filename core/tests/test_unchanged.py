@@ -21,6 +21,9 @@ ELSEWHERE = {"bin": (0.0, 5e-5), "range_m": (STEP, 7.5e-6), "confidence": (0.0, 
 5e-5 bins of 1 ns, and the step in which files store ranges. Kernels use single precision: without
 AVX and FMA delays changed by up to 8.2e-6 bins, and confidences by up to 3.6e-6."""
 OTHERS = (1e-4, 1e-9)
+MEAN_FLUXES = (0.02, 1e-9)
+"""Those in reports on captures: the fit of their pulse ends within 0.2 of the largest log likelihood,
+where rounding decides. With AVX-512 they changed by up to 0.0123."""
 LEAST_ALIKE = 0.99  # of the numbers of one name: rounding decides between equal scores
 
 
@@ -33,13 +36,15 @@ def differing(found: Record, stored: Record) -> list[str]:
     ]
 
 
-def shares_alike(found: Record, stored: Record) -> dict[str, float]:
+def shares_alike(
+    found: Record, stored: Record, others: tuple[float, float] = OTHERS
+) -> dict[str, float]:
     """Return the share within tolerance of the numbers of each kind, such as ``range_m``."""
     alike: dict[str, list[np.ndarray]] = {}
     for name, was in stored.items():
         assert (found[name].dtype, found[name].shape) == (was.dtype, was.shape), name
         kind = name.rpartition(".")[2]
-        rtol, atol = ELSEWHERE.get(kind, OTHERS)
+        rtol, atol = ELSEWHERE.get(kind, others)
         close = np.isclose(found[name], was, rtol, atol, equal_nan=True)
         alike.setdefault(kind, []).append(close.ravel())
     joined = {kind: np.concatenate(each) for kind, each in alike.items()}
@@ -53,7 +58,8 @@ def test_results_are_those_stored(case: str, tmp_path: Path) -> None:
     if SAME_MACHINE:
         assert differing(found, stored) == []
     else:
-        shares = shares_alike(found, stored)
+        others = MEAN_FLUXES if case == "capture reports" else OTHERS
+        shares = shares_alike(found, stored, others)
         assert {kind: share for kind, share in shares.items() if share < LEAST_ALIKE} == {}
 
 
