@@ -160,25 +160,23 @@ def test_where_counts_and_rates_fit_the_refusal_names_counts_first(
 
 
 @pytest.mark.parametrize(
-    ("others", "width_s"),
+    ("others", "width_s", "left_out"),
     [
-        ({"binWidth": 4e-12}, 4e-12),
-        ({"resolution": 4e-12, "bin_size": 4e-12}, 4e-12),
-        ({"resolution": 4e-12, "bin_size": 8e-12}, 1e-9),  # which?
-        ({"resolution": 4.0}, 1e-9),  # in picoseconds, perhaps
-        ({"resolution": np.nan}, 1e-9),
-        ({"width": 4e-12}, 1e-9),
+        ({"binWidth": 4e-12}, 4e-12, []),
+        ({"resolution": 4e-12, "bin_size": 4e-12}, 4e-12, []),
+        ({"bin_size": 1e-9, "resolution": 1e-8}, 1e-9, ["bin_size = 1e-09", "resolution = 1e-08"]),
+        ({"resolution": 4.0}, 1e-9, ["resolution = 4"]),  # in picoseconds, perhaps
+        ({"resolution": np.nan}, 1e-9, []),
+        ({"width": 4e-12}, 1e-9, []),
     ],
 )
 def test_bin_width_in_another_variable(
-    others: dict[str, float],
-    width_s: float,
-    save: Save,
-    write: Write,
+    others: dict[str, float], width_s: float, left_out: list[str], save: Save, write: Write
 ) -> None:
     capture = read_capture(write(save(counts=CUBE, **others)))
     assert capture.acquisition.bin_width_s == width_s
-    assert "guessed: axes (row, col, bin), bin width" in capture.source
+    remarks = "".join(f"{each}, without a unit, left out, " for each in left_out)
+    assert f"guessed: axes (row, col, bin), {remarks}bin width" in capture.source
 
 
 def test_numbers_of_the_own_layout_are_used(save: Save, write: Write) -> None:

@@ -39,7 +39,7 @@ CAPTURE = Capture(
     CUBE.astype(np.uint8),
     ACQUISITION,
     Pulse.measured([1, 2, 1], 1e-9),
-    truth_range_m=np.arange(12.0).reshape(3, 4),
+    truth_range_m=np.arange(150.0, 162.0).reshape(3, 4),
     reported_range_m=np.arange(1.0, 13.0).reshape(3, 4),
     signal=np.full((3, 4), 0.5),
     background=1.5,

@@ -13,7 +13,16 @@ import pytest
 import xarray as xr
 from scipy.io import savemat
 
-from core import Capture, StatedFlux, estimate, read_capture, save_capture, scenes, simulate
+from core import (
+    Capture,
+    CaptureError,
+    StatedFlux,
+    estimate,
+    read_capture,
+    save_capture,
+    scenes,
+    simulate,
+)
 from core.acquisition import Flux, Pulse
 from core.cli import main
 from core.inspection import capture_report
@@ -71,22 +80,51 @@ def test_stated_fluxes_are_read_by_many_names_and_change_no_estimate(
 
 
 @pytest.mark.parametrize("name", WRITE)
-def test_pulses_and_bin_width_are_read_by_other_names_only_where_these_are_plain(
+def test_pulses_and_times_are_read_by_other_names_only_where_these_are_plain(
     name: str, tmp_path: Path
 ) -> None:
     counts = np.ones((3, 4, 8), np.uint16)
-    plain = {"Num_Shots": 200.0, "bin_width_ps": 512.0}
-    for number, (stated, expected) in enumerate(
+    plain = {"Num_Shots": 200.0, "bin_width_ps": 512.0, "gate_delay_ns": 280.0}
+    for number, (stated, expected, left_out) in enumerate(
         (
-            (plain, (200, 512e-12)),
-            (plain | {"pulses": 300.0, "bin_size_ns": 1.0}, (None, 1e-9)),  # contradictions
-            ({"n_frames": 200.0, "cycles": 200.0}, (None, 1e-9)),  # ambiguous
+            (plain, (200, 512e-12, 280e-9), None),
+            (plain | {"bin_size_ns": 0.512}, (200, 512e-12, 280e-9), None),  # the same
+            ({"n_frames": 200.0, "cycles": 200.0}, (None, 1e-9, 0.0), None),  # ambiguous
+            ({"bin_width": 0.5}, (None, 1e-9, 0.0), "bin_width = 0.5, without a unit, left out"),
+            ({"gate_delay": 280.0}, (None, 1e-9, 0.0), "gate_delay = 280, without a unit, left"),
+            ({"bin_width": 5e-10}, (None, 5e-10, 0.0), "guessed: axes (row, col, bin), bin width"),
         )
     ):
         path = tmp_path / f"{number}{name}"
         WRITE[name](path, counts=counts, **stated)
-        found = read_capture(path, pulse=Pulse()).acquisition
-        assert (found.n_pulses, found.bin_width_s) == expected
+        found = read_capture(path, pulse=Pulse())
+        timing = found.acquisition
+        assert (timing.n_pulses, timing.bin_width_s, timing.gate_delay_s) == expected
+        if left_out is None:
+            assert "left out" not in found.source
+        elif not ("axes" in left_out and name in ("a.nc", "a.zarr")):  # which name their axes
+            assert left_out in found.source
+
+
+@pytest.mark.parametrize("name", WRITE)
+def test_a_file_that_contradicts_itself_is_refused_until_the_right_value_is_given(
+    name: str, tmp_path: Path
+) -> None:
+    counts, path = np.ones((3, 4, 8), np.uint16), tmp_path / name
+    WRITE[name](path, counts=counts, bin_width_s=1e-9, bin_size_ps=500.0, shots=200.0, pulses=300.0)
+    options: dict[str, Any] = {"pulse": Pulse()}
+    for field, right, stated in (
+        ("n_pulses", 200, ("200 by shots", "300 by pulses")),
+        ("bin_width_s", 5e-10, ("1e-09 by bin_width_s", "5e-10 by bin_size_ps")),
+    ):
+        others = {"n_pulses": 1, "bin_width_s": 1e-9} | options
+        del others[field]
+        with pytest.raises(CaptureError, match=f"{field} = .*several") as refused:
+            read_capture(path, **others)
+        assert all(each in str(refused.value) for each in stated)
+        options[field] = right
+    found = read_capture(path, **options).acquisition
+    assert (found.n_pulses, found.bin_width_s) == (200, 5e-10)
 
 
 @pytest.mark.parametrize("suffix", CAPTURE_SUFFIXES)

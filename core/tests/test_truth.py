@@ -113,6 +113,25 @@ def test_the_truth_of_a_simulated_capture_is_read(suffix: str, tmp_path: Path) -
     np.testing.assert_array_equal(read_truth(path, CAPTURE).truth_range_m, TRUTH_M)
 
 
+@pytest.mark.parametrize("suffix", CAPTURE_SUFFIXES)
+def test_a_truth_beside_the_counts_that_lies_beyond_the_gate_is_remarked_on(
+    suffix: str, tmp_path: Path
+) -> None:
+    remark = "truth: no target within the gate, 41.9709 to 43.1701 m"
+    acquisition = Acquisition(8, 1e-9, 280e-9, 100)
+    for number, (truth_m, is_beyond) in enumerate(
+        ((42.0, False), (np.nan, False), (41.9, True), (43.2, True))
+    ):
+        truth = np.full((3, 4), np.nan)
+        truth[1, 2] = truth_m
+        capture = Capture(np.ones((3, 4, 8), np.uint16), acquisition, truth_range_m=truth)
+        path = tmp_path / f"{number}{suffix}"
+        save_capture(capture, path)
+        found = read_capture(path)
+        assert (remark in found.source) is is_beyond
+        np.testing.assert_array_equal(found.truth_range_m, truth)
+
+
 def test_a_file_may_state_its_unit(tmp_path: Path) -> None:
     path = tmp_path / "truth.npz"
     np.savez(path, depth_m=TRUTH_M)

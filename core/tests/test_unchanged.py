@@ -22,8 +22,8 @@ ELSEWHERE = {"bin": (0.0, 5e-5), "range_m": (STEP, 7.5e-6), "confidence": (0.0, 
 AVX and FMA delays changed by up to 8.2e-6 bins, and confidences by up to 3.6e-6."""
 OTHERS = (1e-4, 1e-9)
 MEAN_FLUXES = (0.02, 1e-9)
-"""Those in reports on captures: the fit of their pulse ends within 0.2 of the largest log likelihood,
-where rounding decides. With AVX-512 they changed by up to 0.0123."""
+"""Those in reports on captures: the fit of their pulse ends within 0.2 of the largest likelihood's
+logarithm, and rounding decides where. With AVX-512 they changed by up to 0.0123."""
 LEAST_ALIKE = 0.99  # of the numbers of one name: rounding decides between equal scores
 
 

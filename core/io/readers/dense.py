@@ -123,6 +123,7 @@ def cube_capture(
     request: ReadOptions,
     *,
     axes: str | None = None,
+    guessed: Sequence[str] = (),
     **more: Any,
 ) -> Capture:
     """Build a capture from an array of counts, its axes in the given or the usual order.
@@ -134,6 +135,8 @@ def cube_capture(
         Name of the array in errors, and origin of the capture in its source.
     axes : str, optional
         Order of the file's own axes, if known.
+    guessed : sequence of str
+        Guesses made before.
     **more
         As `dense_capture` takes them.
     """
@@ -141,7 +144,7 @@ def cube_capture(
     if order is not None:
         require_cube(cube, name)
         cube = cube.transpose(order)
-    guessed = [] if order else [f"axes ({', '.join(AXES)})"]
+    guessed = [*([] if order else [f"axes ({', '.join(AXES)})"]), *guessed]
     capture = dense_capture(whole_counts(cube, name), origin, request, guessed=guessed, **more)
     return capture if order else with_guesses(capture, axes=" ".join(AXES))
 

@@ -44,7 +44,9 @@ from core.io.readers.layout import (
     require_image,
     require_pulse_in_gate,
     stated_flux,
+    without_unit,
 )
+from core.io.readers.maps import with_own_truth
 from core.io.readers.options import IN_ORDER, ReadOptions
 from core.io.readers.quantities import UNITS_S as TIME_UNITS_S
 from core.io.readers.sample import sample_of
@@ -223,9 +225,10 @@ def read(path: Path, request: ReadOptions) -> Capture:
     known = describe(counts, request, file.origin, file.guessed)
     name, axes = file.counts.stored.name, {"axes": " ".join(AXES)} if file.guessed else {}
     is_own = name.rpartition("/")[2] == "counts"
+    capture = capture_of(np.ascontiguousarray(counts.data), known)
+    capture = with_guesses(capture, variable=name, **axes)
     return replace(
-        with_guesses(capture_of(np.ascontiguousarray(counts.data), known), variable=name, **axes),
-        truth_range_m=file.image("truth_range_m"),
+        with_own_truth(capture, file.image("truth_range_m")),
         reported_range_m=file.image("reported_range_m"),
         signal=file.image("signal"),
         background=number(counts.attrs, "background") if is_own else None,
@@ -364,16 +367,19 @@ def describe(
             known = replace(known, bin_width_s=width_s)
         if known.gate_delay_s is None:
             known = replace(known, gate_delay_s=opens_s)
+    plausible_s, unitless = without_unit(known, counts.attrs)
+    guessed_s = plausible_s or 1e-9
     if stop_s is not None and request.gate_delay_s is None:
         what = f"None: bins open {known.gate_delay_s} s after a pulse"
         require("stop_s", stop_s, known.gate_delay_s is None, what)
-        known = replace(known, gate_delay_s=stop_s - n_bins * (known.bin_width_s or 1e-9))
+        known = replace(known, gate_delay_s=stop_s - n_bins * (known.bin_width_s or guessed_s))
     found = description_of(
         replace(known, n_bins=n_bins),
         n_bins,
         lambda: sample_of(counts.data),  # in memory or not: both lead to the same guess
         str(counts.attrs.get("source", origin)),
-        guessed=[*guessed, *left_out],
+        guessed=[*guessed, *left_out, *unitless],
+        bin_width_s=guessed_s,
     )
     if request.pulse is None and known.pulse is not None:
         require_pulse_in_gate(known.pulse, found.acquisition)

@@ -2,7 +2,8 @@
 
 They are the arrays of an archive, or the attributes of an array of counts. Files of other layouts
 may state fluxes of their pixels under the names of `STATED`, the number of pulses under those of
-`PULSES`, and a bin width with its unit in the name, such as ``bin_width_ps``.
+`PULSES`, and bin width and gate delay with a unit in the name, such as ``bin_width_ps``. A number
+named like a bin width without a unit is taken as seconds if that is plausible, as a guess.
 """
 
 from __future__ import annotations
@@ -37,7 +38,21 @@ PULSES = (
 """Other names of ``n_pulses``, as those of `STATED`. Frames, cycles and exposures may each hold any
 number of pulses."""
 
-_BIN_WIDTHS = {f"{name}{unit}": unit for name in ("binwidth", "binsize") for unit in UNITS_S}
+_TIMES = {
+    "bin_width_s": ("binwidth", "binsize", "binresolution", "timeresolution", "resolution"),
+    "gate_delay_s": ("gatedelay", "gatestart", "gateopening"),
+}
+"""Names of times, likewise, to which a file may add the unit."""
+
+_WITH_UNIT = {
+    f"{name}{unit}": (field, unit)
+    for field, names in _TIMES.items()
+    for name in names
+    for unit in UNITS_S
+}
+_WITHOUT_UNIT = {name: field for field, names in _TIMES.items() for name in names}
+_PLAUSIBLE_WIDTHS_S = 1e-13, 1e-6
+_SAME = 1e-6  # relative difference of two statements, such as one in single precision
 
 PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 """Fields that define a pulse together."""
@@ -70,14 +85,12 @@ def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
         If a field is invalid.
     """
     values: dict[str, Any] = {}
-    for name in (*TIMING, "detection"):
-        if getattr(request, name) is None and name in known:
-            values[name] = known[name] if name == "detection" else number(known, name)
-    for name, value in _by_other_names(known).items():
-        if getattr(request, name) is None:
-            values.setdefault(name, value)
-    if "n_pulses" in values:
-        n_pulses = values["n_pulses"]
+    if request.detection is None and "detection" in known:
+        values["detection"] = known["detection"]
+    left = [name for name in TIMING if getattr(request, name) is None]
+    for name, stated in _stated(known, left).items():
+        values[name] = _agreed(name, stated)
+    if (n_pulses := values.get("n_pulses")) is not None:
         whole = n_pulses.is_integer() and n_pulses >= 0
         require("n_pulses", n_pulses, whole, "a whole number, 0 if not known")
         values["n_pulses"] = int(n_pulses) or None
@@ -88,19 +101,69 @@ def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
 
 def timing(names: Iterable[str]) -> list[str]:
     """Return the names of `TIMING` among those of a file, and other names of the same numbers."""
-    return [name for name in names if name in TIMING or _plain(name) in (*PULSES, *_BIN_WIDTHS)]
+    others = {*PULSES, *_WITH_UNIT, *_WITHOUT_UNIT}
+    return [name for name in names if name in TIMING or _plain(name) in others]
 
 
-def _by_other_names(known: Mapping[str, Any]) -> dict[str, float]:
-    """Return pulses and bin width by their names in `TIMING`; none that is stated in two ways."""
-    found: dict[str, set[float]] = {"n_pulses": set(), "bin_width_s": set()}
+def without_unit(request: ReadOptions, known: Mapping[str, Any]) -> tuple[float | None, list[str]]:
+    """Return the bin width that numbers without a unit give, and what is left out of these.
+
+    Parameters
+    ----------
+    request : ReadOptions
+        As `completed` returns it.
+    known : mapping
+        Numbers of the file.
+
+    Returns
+    -------
+    bin_width_s : float or None
+        The only number that is plausible in seconds; None if it is known already, or there is none.
+    left_out : list of str
+        Numbers whose unit would be needed.
+    """
+    stated: dict[str, dict[str, float]] = {}
+    for name in known:
+        field, value = _WITHOUT_UNIT.get(_plain(name), ""), _real(known[name])
+        if field and value is not None and getattr(request, field) is None:
+            stated.setdefault(field, {})[name] = value
+    low_s, high_s = _PLAUSIBLE_WIDTHS_S
+    widths_s = {each for each in stated.get("bin_width_s", {}).values() if low_s <= each <= high_s}
+    if len(widths_s) == 1:
+        del stated["bin_width_s"]
+    left_out = [
+        f"{name} = {value:g}, without a unit, left out"
+        for values in stated.values()
+        for name, value in values.items()
+    ]
+    return widths_s.pop() if len(widths_s) == 1 else None, left_out
+
+
+def _stated(known: Mapping[str, Any], timing: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return what a file states for some fields of `TIMING`, by the file's own names."""
+    found: dict[str, dict[str, float]] = {}
+    for name in timing:
+        if (value := number(known, name)) is not None and (name, value) != ("n_pulses", 0):
+            found[name] = {name: value}
     for name in known:
         value, plain = _real(known[name]), _plain(name)
-        if plain in PULSES and value and value.is_integer() and 1 <= value <= MOST_PULSES:
-            found["n_pulses"].add(value)
-        elif plain in _BIN_WIDTHS and value:
-            found["bin_width_s"].add(parsed_time(f"{value!r} {_BIN_WIDTHS[plain]}"))
-    return {name: values.pop() for name, values in found.items() if len(values) == 1}
+        if name in TIMING or value is None:
+            continue
+        if plain in PULSES and value.is_integer() and 1 <= value <= MOST_PULSES:
+            found.setdefault("n_pulses", {})[name] = value
+        elif plain in _WITH_UNIT and (value or plain.startswith("gate")):
+            field, unit = _WITH_UNIT[plain]
+            found.setdefault(field, {})[name] = parsed_time(f"{value!r} {unit}")
+    return {name: found[name] for name in timing if name in found}
+
+
+def _agreed(field: str, stated: Mapping[str, float]) -> float:
+    """Return the value of which all statements are; raise ``ValueError`` if they contradict."""
+    values = list(stated.values())
+    agree = len(values) == 1 or max(values) - min(values) <= _SAME * max(map(abs, values))
+    shown = ", ".join(f"{value:.6g} by {name}" for name, value in stated.items())
+    require(field, shown, agree, f"{field}, of which the file states several")
+    return values[0]
 
 
 def _real(given: Any) -> float | None:

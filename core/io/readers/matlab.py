@@ -4,8 +4,7 @@ Either a cell array (row, col) holding each pixel's photon arrival times as a ve
 (row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts, as published simulated
 captures are stored. The file may have other variables if only one fits. Numbers under the names of
 the project's own layout, ``bin_width_s``, ``gate_delay_s``, ``n_pulses`` and ``pixel_angle_rad``,
-are used; fluxes under the names of `core.io.readers.layout.STATED` are kept. A number named like
-``bin_width`` or ``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
+and under the other names of `core.io.readers.layout`, are used; fluxes are kept.
 
 The pixels of a sparse matrix follow each other column by column, as MATLAB's ``reshape`` lists
 them, or row by row with ``axes="row col"``. Rows and columns come from ``shape``; without it they
@@ -19,7 +18,7 @@ three arrays.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import isqrt, prod
@@ -41,7 +40,7 @@ from core.io.readers.dense import (
 )
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.layout import completed, stated_flux, stating, timing
+from core.io.readers.layout import completed, stated_flux, stating, timing, without_unit
 from core.io.readers.maps import Map
 from core.io.readers.options import ReadOptions, choose_variable
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
@@ -53,9 +52,6 @@ _VERSIONS_5 = (b"\x00\x01IM", b"\x01\x00MI")
 NUMERIC = ("double", "single", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
 
 _FRACTIONS = ("double", "single")
-
-_WIDTH_NAMES = {"binwidth", "binsize", "binresolution", "timeresolution", "resolution"}
-_SHORTEST_S, _LONGEST_S = 1e-13, 1e-6
 
 
 class Variable(NamedTuple):
@@ -84,11 +80,6 @@ class Variable(NamedTuple):
     def is_number(self) -> bool:
         """Whether it is a single number."""
         return self.kind in NUMERIC and set(self.shape) == {1}
-
-    @property
-    def may_be_bin_width(self) -> bool:
-        """Whether it is a single number with a name like that of a bin width."""
-        return self.is_number and self.name.lower().replace("_", "") in _WIDTH_NAMES
 
 
 class _Version5:
@@ -190,28 +181,32 @@ def read(path: Path, request: ReadOptions) -> Capture:
     def values(names: Iterable[str]) -> dict[str, Any]:
         return {name: file.array(numbers[name]) for name in names if name in numbers}
 
-    origin = f"{path.name}, variable {variable.name}"
-    capture = _capture(file, variable, origin, completed(request, values(timing(numbers))))
+    origin, known = f"{path.name}, variable {variable.name}", values(timing(numbers))
+    capture = _capture(file, variable, origin, completed(request, known), known)
     capture = replace(capture, stated_flux=stated_flux(values(stating(numbers))))
     return with_guesses(capture, variable=variable.name)
 
 
 def _capture(
-    file: _Version5 | _Version73, variable: Variable, origin: str, request: ReadOptions
+    file: _Version5 | _Version73,
+    variable: Variable,
+    origin: str,
+    request: ReadOptions,
+    known: Mapping[str, Any],
 ) -> Capture:
     name = variable.name
     if variable.kind == "cell":
         times, pixel = file.cells(variable)
         shape = (variable.shape[0], variable.shape[1])
         return arrivals_capture(times, pixel, shape, name, origin, request)
-    width_s = _bin_width(
-        float(file.array(one).item()) for one in file.variables if one.may_be_bin_width
-    )
+    width_s, left_out = without_unit(request, known)
     if variable.kind == "sparse":
         parts = file.sparse(variable)
         shaped, guessed = _with_shape(request, variable, file.variables)
+        guessed += left_out
         return _sparse_capture(parts, variable.shape, name, origin, shaped, guessed, width_s)
-    return cube_capture(file.array(variable), name, origin, request, bin_width_s=width_s)
+    counts = file.array(variable)
+    return cube_capture(counts, name, origin, request, guessed=left_out, bin_width_s=width_s)
 
 
 def maps(path: Path) -> list[Map]:
@@ -258,12 +253,6 @@ def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
     accepted += "(pixel, bin)"
     whole = {each: variable.kind not in _FRACTIONS for each, variable in fitting.items()}
     return fitting[choose_variable(name, fitting, whole, accepted, listed)]
-
-
-def _bin_width(values: Iterable[float]) -> float | None:
-    """Return the one number that can be the width of a bin in seconds; None if not just one."""
-    found = {value for value in values if _SHORTEST_S <= value <= _LONGEST_S}
-    return found.pop() if len(found) == 1 else None
 
 
 def _with_shape(

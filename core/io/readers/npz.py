@@ -63,8 +63,9 @@ from core.io.readers.layout import (
     stated_flux,
     stating,
     timing,
+    without_unit,
 )
-from core.io.readers.maps import Map
+from core.io.readers.maps import Map, with_own_truth
 from core.io.readers.npy import frames_in, read_array, read_header
 from core.io.readers.options import ReadOptions, choose_variable
 from core.labels import fields_of, stated_fields
@@ -126,7 +127,11 @@ def read(path: Path, request: ReadOptions) -> Capture:
             counts = _array(archive, name)
             require_counts(counts, name, request.axes)
             known = {each: _field(archive, each) for each in numbers}
-            capture = cube_capture(counts, name, origin, completed(request, known))
+            complete = completed(request, known)
+            width_s, left_out = without_unit(complete, known)
+            capture = cube_capture(
+                counts, name, origin, complete, guessed=left_out, bin_width_s=width_s
+            )
             return with_guesses(replace(capture, stated_flux=stated), variable=name)
         kept = {*numbers, *_FIELDS}
         known = {field: _field(archive, field) for field in names if field in kept}
@@ -149,12 +154,13 @@ def read(path: Path, request: ReadOptions) -> Capture:
             in_order = request.order(AXES) in (None, (0, 1, 2))
             require("axes", request.axes, in_order, repr(" ".join(AXES)))
             counts = stored_counts(_array(archive, name), name)
-            capture = dense_capture(counts, origin, complete)
+            width_s, left_out = without_unit(complete, known)
+            capture = dense_capture(counts, origin, complete, guessed=left_out, bin_width_s=width_s)
         if request.pulse is None:
             require_pulse_in_gate(capture.pulse, capture.acquisition)
+        truth_m = _image(archive, "truth_range_m", capture.shape)
         return replace(
-            with_guesses(capture, variable=name),
-            truth_range_m=_image(archive, "truth_range_m", capture.shape),
+            with_own_truth(with_guesses(capture, variable=name), truth_m),
             reported_range_m=_image(archive, "reported_range_m", capture.shape),
             signal=_image(archive, "signal", capture.shape),
             background=number(known, "background"),

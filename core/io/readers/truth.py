@@ -36,7 +36,7 @@ from core.io.readers.guards import FileVersion
 from core.io.readers.isolation import isolated
 from core.io.readers.labelled import UNITS_S
 from core.io.readers.layout import require_image
-from core.io.readers.maps import Map
+from core.io.readers.maps import Map, are_in_gate, gate_m
 from core.io.readers.sequence import files_of
 
 TRUTH_UNITS = ("m", "bins", "ns")
@@ -195,7 +195,7 @@ def _are_mostly_in_gate(values: NDArray[Any], unit: str, acquisition: Acquisitio
         truth_m = _ranges_m(values, unit, acquisition)
     except ValueError:
         return False
-    inside = _in_gate(truth_m, acquisition)
+    inside = are_in_gate(truth_m, acquisition)
     return bool(inside.any() and inside.mean() >= 0.5)
 
 
@@ -337,22 +337,10 @@ def _ranges_m(values: NDArray[Any], unit: str, acquisition: Acquisition) -> Floa
     return np.asarray(numbers * (UNITS_S[unit] * SPEED_OF_LIGHT_M_S / 2))
 
 
-def _in_gate(truth_m: Floats, acquisition: Acquisition) -> NDArray[np.bool_]:
-    """Return whether each target, NaN aside, is within the gate."""
-    known = truth_m[np.isfinite(truth_m)]
-    low_m, high_m = _gate_m(acquisition)
-    return np.asarray((known >= low_m) & (known <= high_m))
-
-
-def _gate_m(acquisition: Acquisition) -> tuple[float, float]:
-    low_m, high_m = acquisition.bin_to_range_m([0, acquisition.n_bins]).tolist()
-    return low_m, high_m
-
-
 def _require_in_gate(truth_m: Floats, acquisition: Acquisition) -> None:
     """Raise ``ValueError`` if no target lies within the gate, as in a wrong unit."""
     known = truth_m[np.isfinite(truth_m)]
-    low_m, high_m = _gate_m(acquisition)
+    low_m, high_m = gate_m(acquisition)
     found = f"{known.min():.6g} to {known.max():.6g} m" if known.size else "no target"
     accepted = f"targets within the gate, {low_m:.6g} to {high_m:.6g} m, in another unit perhaps"
-    require("true ranges", found, bool(_in_gate(truth_m, acquisition).any()), accepted)
+    require("true ranges", found, bool(are_in_gate(truth_m, acquisition).any()), accepted)
