@@ -91,6 +91,33 @@ def test_frames_in_which_0_is_no_trigger_are_no_cube(
     np.testing.assert_array_equal(read_capture(path, axes="row col bin").cube, stack)
 
 
+@pytest.mark.parametrize("no_trigger", [-1, 100, 255, 1023, 65535])
+@pytest.mark.parametrize("shape", [(1000, 16, 16), (200, 12, 16)])
+def test_frames_with_any_mark_name_it(
+    no_trigger: int, shape: tuple[int, int, int], write: Write
+) -> None:
+    """A quarter of the pulses do not fire; the others do in one of 100 bins."""
+    first = np.random.default_rng(4).exponential(70, shape).astype(int)
+    stack = np.where(first < 100, first, no_trigger).astype(np.int32)
+    path = write("f.npy", npy_bytes(stack))
+    with pytest.raises(CaptureError, match=f"give {no_trigger} if .* raw frames .*% of"):
+        read_capture(path)
+    assert read_capture(path, no_trigger=no_trigger).acquisition.n_bins == 100
+
+
+def test_saturated_or_equal_counts_have_no_mark(write: Write) -> None:
+    rng = np.random.default_rng(5)
+    background = rng.poisson(3.0, (64, 48, 100))
+    echo = background + 100 * (np.arange(100) == 30)
+    for counts in (
+        np.minimum(rng.poisson(40 * np.exp(-np.arange(100) / 20), background.shape), 30),
+        np.minimum(echo, 90),
+        np.where(np.arange(100) == 30, 50, background),
+    ):
+        path = write("c.npy", npy_bytes(counts.astype(np.uint16)))
+        np.testing.assert_array_equal(read_capture(path).cube, counts)
+
+
 @pytest.mark.parametrize("share", [0.7, 0.9, 0.97])
 def test_frames_in_which_most_pixels_fire_are_no_cube(share: float) -> None:
     """Half of the light is background over 100 bins, half from a slope."""

@@ -36,6 +36,10 @@ AXES = ("pulse", "row", "col")
 STRETCH = 2**20
 MOST_GUESSED_BINS = 2**16
 _LARGEST_USUAL_COUNT = 255
+_FEWEST_FRAMES = 50
+_LEAST_MARK = 16  # beyond the bins of any gate
+_MARKED = 0.01  # share of the array
+_TIMES_AS_OFTEN = 10  # as the value below
 
 Stretch = tuple[tuple[int, int, int], NDArray[Any]]
 """Pulse, row and column of the first of some frames, and the frames (pulse, row, col)."""
@@ -173,24 +177,41 @@ def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
     Raises
     ------
     AmbiguousError
-        If more than half of the array is one value that hardly is a count (its least one if that
-        is negative, its largest one above 255): such a value probably marks the pulses without a
-        trigger. Without `axes` also if `core.io.readers.frame_guess` takes 0 for that value.
+        If one value hardly is a count, and thus probably marks the pulses without a trigger: the
+        least one if that is negative, or the largest one if it is frequent everywhere. Without
+        `axes` also if `core.io.readers.frame_guess` takes 0 for that value.
     """
     if array.ndim != 3 or not array.size or array.dtype.kind not in "iuf":
         return
     frames = f"raw frames ({', '.join(AXES)})"
     least, largest = array.min().item(), array.max().item()
     for value in (least, largest):
-        is_count = 0 <= value <= _LARGEST_USUAL_COUNT
-        if not is_count and np.count_nonzero(array == value) > array.size / 2:
+        if _hardly_counts(array, value):
+            share = np.count_nonzero(array == value) / array.size
             raise _are_frames(
-                value, f"if {name} holds {frames}: more than half of its values are {value}"
+                value, f"if {name} holds {frames}: {share:.0%} of its values are {value}"
             )
     if axes is None and least == 0 and resembles_frames(array):
         counts = {"Counts": {"axes": "row col bin"}}
         what = f"if {name} holds {frames}, as it seems, or axes = 'row col bin' if it holds counts"
         raise _are_frames(0, what, counts)
+
+
+def _hardly_counts(array: NDArray[Any], value: float) -> bool:
+    """Return whether the least or the largest value of an array is none, or too frequent a count.
+
+    Of counts, the largest is rarer than the one below, or lies in a few bins.
+    """
+    here = array == value
+    n_here, n_below = np.count_nonzero(here), np.count_nonzero(array == value - 1)
+    if n_here > array.size / 2 and not 0 <= value <= _LARGEST_USUAL_COUNT:
+        return True
+    if len(array) < _FEWEST_FRAMES or n_here < _MARKED * array.size:
+        return False
+    if value < 0:
+        return not np.any((array < 0) & ~here)
+    is_everywhere = all(here.any(axis=tuple({0, 1, 2} - {axis})).mean() > 0.5 for axis in range(3))
+    return bool(value >= _LEAST_MARK and n_here > _TIMES_AS_OFTEN * n_below and is_everywhere)
 
 
 def _are_frames(
