@@ -1,11 +1,15 @@
 """Hot and dead pixels: significantly more or fewer detections than all neighbours.
 
+Dead pixels may touch, as those of a dead column do: without any detection, a pixel is also dead if
+the background of the others, even a tenth of it, would have fired it.
+
 The excess of a hot pixel is spread over the gate. A pixel whose excess lies in an echo is not hot:
 it sees a bright surface.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -22,6 +26,8 @@ NEIGHBOURS = 3
 SIGNIFICANCE = 1e-6
 """Probability below which counts are not explained by chance."""
 
+_DIMMEST = 0.1  # background of a pixel relative to the mean
+_DARKEST = 0.1  # share of the bins
 _ECHO_LENGTHS = 3  # an echo, and as many bins before and behind it
 
 _AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
@@ -37,7 +43,7 @@ class OutlierPixels(NamedTuple):
     bright: NDArray[np.bool_]
     """Significantly more counts than any neighbour, in an echo."""
     dead: NDArray[np.bool_]
-    """Significantly fewer counts than any neighbour, and no echo."""
+    """Significantly fewer counts than any neighbour, and no echo; or none over a background."""
     dark: NDArray[np.bool_]
     """Significantly fewer counts than any neighbour, and an echo."""
     most: NDArray[np.int64]
@@ -76,7 +82,18 @@ def outlier_pixels(capture: Capture) -> OutlierPixels | None:
     # Their excess lies in the echo: the other bins do not hold significantly more.
     bright[hot] = has_echo & (probability_of_more(beside, most[hot], n_pulses) >= SIGNIFICANCE)
     dark[dead], _ = _echoes(capture.cube[dead], width, n_pulses)
+    if math.exp(-_DIMMEST * _background_counts(capture)) < SIGNIFICANCE:
+        dead |= counts == 0
     return OutlierPixels(hot & ~bright, bright, dead & ~dark, dark, most, least)
+
+
+def _background_counts(capture: Capture) -> float:
+    """Mean counts of a pixel that detects anything if all bins held as few as the darkest do."""
+    lit = capture.counts > 0
+    if lit.all() or not lit.any():
+        return 0.0  # there is no pixel to compare, or none to compare with
+    per_bin = capture.cube.sum(axis=(0, 1), dtype=np.int64) / np.count_nonzero(lit)
+    return float(np.quantile(per_bin, _DARKEST) * per_bin.size)
 
 
 def _echoes(
@@ -131,7 +148,8 @@ def pixel_verdict(capture: Capture, row: int, col: int) -> PixelVerdict:
     elif found.dark[row, col]:
         why = "significantly fewer than any of them, with the echo of a dark surface"
     elif found.dead[row, col]:
-        health, why = "dead", "significantly fewer than any of them"
+        why = "significantly fewer than any of them" if least > 0 else "no background fires it"
+        health = "dead"
     elif counts == 0:
         health, why = "cannot tell", "too few to distinguish a dead pixel from a dark one"
     elif n_pulses is not None and probability_of_more(n_pulses, most, n_pulses) > SIGNIFICANCE:

@@ -359,6 +359,27 @@ def test_a_dark_surface_between_bright_ones_is_not_dead() -> None:
     assert [(each.row, each.col) for each in found if each.health == "dead"] == [(5, 6)]
 
 
+def test_pixels_of_a_dead_column_are_dead_but_not_those_of_a_night_sky() -> None:
+    scene = random_depths(24, seed=1)
+    capture = simulate(scene, replace(scene.acquisition, n_pulses=500), Flux(0.1, sbr=0.1), seed=0)
+    broken = capture.cube.copy()
+    broken[:, 20] = broken[10, 5] = 0
+    day = replace(capture, cube=broken)
+    assert inspection.capture_report(day).n_dead == 25
+    assert pixel_verdict(day, 12, 20).health == "dead"
+    assert "no background fires it" in pixel_verdict(day, 12, 20).why
+    # The fluxes are those of the pixels that work, and no surface is certain in the others.
+    background = inspection.capture_report(day).flux.background
+    assert background.low < 1.0 < background.high
+    assert estimate(day, "image_posterior").confidence[:, 20].max() < 0.5
+    night = simulate(
+        scene, replace(scene.acquisition, n_pulses=500), Flux(0.1, sbr=math.inf), seed=0
+    )
+    sky = night.cube.copy()
+    sky[:6] = 0
+    assert inspection.capture_report(replace(night, cube=sky)).n_dead == 0
+
+
 def test_a_pixel_may_miss_pulses_that_its_neighbours_do_not() -> None:
     assert probability_of_fewer(398, 400, 400) > 0.1
     assert probability_of_fewer(200, 400, 400) < 1e-100
