@@ -101,10 +101,12 @@ def _locate(
 def _confidence(
     capture: Capture, flux: FluxModel, delay_bin: Floats, parameters: VelocityParameters
 ) -> Floats:
-    found = _surfaces(capture, parameters)
-    if found is None:
+    motion = motion_of(capture, parameters)
+    if motion is None or motion.surfaces is None:
         return tolerance_probability(capture, delay_bin)
-    return mass_near(found.surface, 1, delay_bin, capture.acquisition.n_bins)
+    near = mass_near(motion.surfaces.surface, 1, delay_bin, capture.acquisition.n_bins)
+    # At the end of the velocities tried a surface may be faster, and its echo elsewhere.
+    return np.where(np.isinf(motion.velocity.sd_bins), 0.0, near)
 
 
 def _velocity(capture: Capture, parameters: VelocityParameters) -> RadialVelocity | None:

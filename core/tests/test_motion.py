@@ -172,6 +172,17 @@ def test_shared_velocity_restores_a_moving_scene(per_1000_bins: float) -> None:
 
 
 @pytest.mark.compiled
+def test_surfaces_faster_than_any_velocity_tried_have_no_confidence() -> None:
+    capture = drawn(moving(thinned(scenes["wall"]()), 40.0), 0.3)
+    found = estimate(capture, "velocity")
+    assert found.velocity is not None
+    at_end = np.isinf(found.velocity.sd_bins)
+    assert at_end.mean() > 0.5
+    assert (found.confidence[at_end] == 0).all()
+    assert estimate(capture, "velocity", most_bins=48).confidence.mean() > 0.9
+
+
+@pytest.mark.compiled
 def test_velocities_are_shared_by_neighbours_only_within_reach() -> None:
     scene = scenes["wall"](16)
     here, there = (drawn(moving(scene, each), 0.3) for each in (0.0, 8.0))
