@@ -104,6 +104,8 @@ class Row:
     written: str = ""
     source: str = ""
     error: str = ""
+    remark: str = ""
+    """Why confidences mislead and what is left out of the model, as `estimate` says."""
 
     @property
     def shape(self) -> str:
@@ -181,6 +183,9 @@ def _batch(chosen: argparse.Namespace) -> None:
         show({row.file: asdict(row) for row in rows}, as_json=True)
     else:
         print(as_markdown(_PRINTED, map(_cells, rows), {"seconds": ".3g", "SBR": ".3g"}))
+        for row in rows:
+            if row.remark:
+                print(f"{row.file}: {row.remark}.")
     if summary is not None:
         with whole_file(summary, overwrite=chosen.overwrite) as file:
             file.write(_csv(rows, jobs[0]).encode())
@@ -274,7 +279,7 @@ def range_one(job: Job) -> Row:
     started, name = perf_counter(), printable(str(job.path))
     try:
         refused = refused_outputs(job.outputs, (*WRITERS, *FOLDER_WRITERS), job.overwrite)
-        described, image, sbr = _estimate(job)
+        described, image, sbr, remark = _estimate(job)
         save = save_ranges(
             described,
             image,
@@ -305,6 +310,7 @@ def range_one(job: Job) -> Row:
         ", ".join(map(str, written)),
         described.source,
         "; ".join(_one_line(error) for error in refused.values()),
+        remark,
     )
 
 
@@ -313,20 +319,24 @@ def _one_line(error: Exception) -> str:
     return printable(text) or type(error).__name__
 
 
-def _estimate(job: Job) -> tuple[CaptureInfo, RangeImage, float]:
-    """Return a description, estimates and SBR; a file larger than memory is ranged in tiles."""
+def _estimate(job: Job) -> tuple[CaptureInfo, RangeImage, float, str]:
+    """Return a description, estimates, SBR and remark.
+
+    A file larger than memory is ranged in tiles, whose SBR is not known, and without a remark.
+    """
     n_bytes = bytes_of(job.path, **job.options)
     if n_bytes is None or n_bytes <= MAX_CUBE_BYTES:
         capture: Capture = read_capture(job.path, **job.options)
         found = run(capture, job.method, job.settings, job.false_alarm, job.judged_by)
-        return capture, found.image, estimate_mean_flux(capture).sbr.value
+        remark = ESTIMATORS[job.method].remark(capture, job.false_alarm, job.settings)
+        return capture, found.image, estimate_mean_flux(capture).sbr.value, remark
     from core.out_of_core import tiles  # noqa: PLC0415 - loads Dask
 
     refuse_further_values(job.intervals, job.fit)
     refuse_judging(job.judged_by)
     counts = open_capture(job.path, **job.options)
     parts = tiles.estimate_large(counts, job.method, job.settings, false_alarm=job.false_alarm)
-    return *tiles.as_image(parts.compute()), np.nan
+    return *tiles.as_image(parts.compute()), np.nan, ""
 
 
 def _cells(row: Row) -> tuple[Any, ...]:

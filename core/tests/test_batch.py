@@ -17,7 +17,7 @@ from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.cli import main
 from core.cli.batch import Job, ranged
-from core.estimators import estimate
+from core.estimators import ESTIMATORS, estimate
 from core.estimators.base import NoParameters
 from core.geometry import Box
 from core.inspection import estimate_mean_flux
@@ -67,8 +67,10 @@ def test_a_failing_file_is_a_row_and_the_others_are_ranged(
     table = csv.DictReader(Path("found/summary.csv").read_text("utf-8").splitlines())
     rows = {row["file"]: row for row in table}
     assert list(rows) == ["runs/day/a.npz", "runs/night/a.npz", "runs/night/b.npz"]
-    for line, row in zip(out.splitlines()[2:], rows.values(), strict=True):
+    for line, row in zip(out.splitlines()[2:5], rows.values(), strict=True):
         assert row["file"] in line and row["error"] in line
+    remarks = {row["file"]: row["remark"] for row in rows.values() if row["remark"]}
+    assert out.splitlines()[5:] == [f"{name}: {remark}." for name, remark in remarks.items()]
     for seed, name in enumerate(("day-a", "night-a")):
         capture = stairs(seed)
         image = estimate(capture, "tracking", t_n=12)
@@ -83,6 +85,7 @@ def test_a_failing_file_is_a_row_and_the_others_are_ranged(
         assert float(row["seconds"]) > 0
         assert row["error"] == "" and row["method"] == "tracking"
         assert json.loads(row["settings"]) == asdict(TrackingParameters(t_n=12))
+        assert row["remark"] == ESTIMATORS["tracking"].remark(capture)
         assert row["software"].startswith("firstphoton ")
         assert capture.source in row["source"]
     failed = rows["runs/night/b.npz"]
