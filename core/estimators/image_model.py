@@ -153,6 +153,7 @@ def _flux_priors(capture: Capture) -> Iterator[tuple[FluxPrior, Capture | None]]
             levels=prior.levels / each,
             background=prior.background / each,
             own_weight=own.own_weight,
+            at_total=prior.at_total and prior.at_total / each,
         )
         yield per_pixel, replace(pooled, flux_prior=prior)
 
@@ -289,15 +290,17 @@ def with_any_level(capture: Capture, flux: FluxModel, empty: float) -> FluxModel
     """Return a flux model with levels of any strength, and a share `empty` without a surface."""
     typical = float(flux.typical_signal.mean())
     share = np.append(empty, np.full(_ANY_LEVEL.size, (1 - empty) / _ANY_LEVEL.size))
+    known = detailed_flux_prior_of(capture)
     prior = FluxPrior(
         np.append(0.0, typical * _ANY_LEVEL),
         share,
         flux.depth,
         np.asarray(flux.typical_background.mean()),
-        detailed_flux_prior_of(capture).own_weight,
+        known.own_weight,
         flux.contrast,
         flux.pile_up,
         flux.background_shape,
+        known.at_total,
     )
     return replace(flux_model_with(capture, prior), agreement=flux.agreement)
 

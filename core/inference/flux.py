@@ -4,6 +4,9 @@ The distributions of signal levels and of delays are estimated from a sample of 
 (nonparametric maximum likelihood of a mixing distribution, Kiefer & Wolfowitz 1956, on a grid of
 levels that includes "no echo"). The background of a pixel is its total rate minus the signal level.
 
+Signals are alike over the image, or in proportion to the totals of the pixels, whichever is
+likelier: a surface that reflects less of the pulse often reflects less of the sunlight, too.
+
 At a low SBR single pixels hardly show their level, and a signal that is not found raises the
 background, which hides it further. Then the distribution of delays, which many pixels show
 together, is estimated for each level, and the likeliest level is tried as that of all echoes.
@@ -29,7 +32,7 @@ from core.inference.background import (
     mean_background,
     nodes_of,
 )
-from core.inference.flux_model import FluxModel, FluxPrior
+from core.inference.flux_model import FluxModel, FluxPrior, Totals
 from core.inference.likelihood import (
     level_densities,
     level_evidence,
@@ -54,8 +57,13 @@ _LAST_DEPTH_STEPS = 30  # likewise, from a distribution that is already found
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _CLEAR = 1.0  # mean gain in log likelihood of pixels that show their signal levels one by one
+_MOST_OF_SCATTER = 0.5  # of the totals, due to backgrounds, for which signals may depend on them
+_LEAST_GAIN_IN_PROPORTION = 10.0  # of all pixels, for signals that depend on the totals
 _LEAST_JOINT_GAIN = 15.0  # of all pixels; without echoes it was at most 9 in 96 captures
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
+_MARGIN = 5  # times as many, which chance may leave instead
+_CLEARLY_MORE = 2.0  # standard deviations of a total above the background, for which an echo fired
+_VARIANCE_OF_MEDIAN = math.pi / 2  # relative to that of the mean of a Gaussian
 _MANY_SPENT = 0.01  # share of the pixels with so few of them, which biases the mean total
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
@@ -75,7 +83,14 @@ def flux_model_of(capture: Capture) -> FluxModel:
 
 def flux_model_with(capture: Capture, flux_prior: FluxPrior) -> FluxModel:
     """Return the flux model of a capture with flux parameters from elsewhere."""
-    return flux_prior.model(_totals(capture)[0], _least_background(capture))
+    return flux_prior.model(_totals(capture).of, _least_background(capture))
+
+
+def _model_of_pixels(
+    capture: Capture, flux_prior: FluxPrior, pixels: NDArray[np.intp], least_background: float
+) -> FluxModel:
+    """Return the fluxes of pixels, given as flat indices, in one row."""
+    return flux_prior.model(_totals(capture).of.of_pixels(pixels), least_background)
 
 
 @cached_per_capture
@@ -202,8 +217,7 @@ def _background(
     `density` is that of `level_densities`.
     """
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
-    total = _totals(capture)[0].ravel()[pixels]
-    flux = known.model(total[np.newaxis], _least_background(capture))
+    flux = _model_of_pixels(capture, known, pixels, _least_background(capture))
     seen = capture.cube.reshape(-1, n_bins)[pixels], n_pulses, echo_window(capture)
     guess, background = known.relative_background, flux.background[:, 0].T
     free = echo_free(density, known.share[:, np.newaxis] * known.depth, background, *seen, guess)
@@ -222,16 +236,31 @@ def _background(
 def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, _Shapes]:
     """Estimate `detailed_flux_prior_of` with a shape of the background, and better shapes.
 
+    Where pixels differ in their backgrounds, signals may be in proportion to them.
+    """
+    alike = _estimated(capture, shape, None)
+    if alike[0].own_weight < _MOST_OF_SCATTER:
+        return alike
+    in_proportion = _estimated(capture, shape, float(_totals(capture).of.rate.mean()))
+    gain = _log_likelihood(capture, in_proportion[0]) - _log_likelihood(capture, alike[0])
+    return in_proportion if gain > _LEAST_GAIN_IN_PROPORTION else alike
+
+
+def _estimated(
+    capture: Capture, shape: Floats | None, at_total: float | None
+) -> tuple[FluxPrior, _Shapes]:
+    """Estimate `_flux_prior` with signals that depend on the totals of pixels, or do not.
+
     The total rate of a pixel (Coates 1968) is signal plus background. The total minus a signal
     level is shrunk towards the mean background of the image as far as its scatter is explained by
     chance (James & Stein 1961, with the variance of Greenwood 1926). If all pixels see the same
     background, all get the same value. Where all pulses fire, only the background of a pixel is
     known (`_background_of`), from which no signal is subtracted.
     """
-    total, chance, signal_share, _ = _totals(capture)
-    flat = capture.cube.reshape(total.size, -1)
-    pixels, least = _sampled(total.size, SAMPLE)[np.newaxis], _least_background(capture)
-    levels = _levels(flat[pixels[0]], capture, shape)
+    (total, has_signal, _), chance, _ = _totals(capture)
+    flat, signal_share = capture.cube.reshape(total.size, -1), float(has_signal.mean())
+    pixels, least = _sampled(total.size, SAMPLE), _least_background(capture)
+    levels = _levels(pixels, capture, shape, at_total)
     # Initially each level is the signal of all pixels; a few pixels show how many have it.
     found = FluxPrior(
         levels,
@@ -240,15 +269,16 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, _Sha
         background=total.mean() - signal_share * levels[:, np.newaxis, np.newaxis],
         own_weight=_own_weight(total, chance),
         background_shape=shape,
+        at_total=at_total,
     )
-    start = found
-    for some in (_sampled(total.size, SAMPLE // 4)[np.newaxis], pixels):
-        flux = found.model(total.ravel()[some], least)
-        evidence = level_evidence(prepare(capture, flat[some], flux, 1))
+    start, squared = found, float((found.brightness(total) ** 2).mean())
+    for some in (_sampled(total.size, SAMPLE // 4), pixels):
+        flux = _model_of_pixels(capture, found, some, least)
+        evidence = level_evidence(prepare(capture, flat[np.newaxis, some], flux, 1))
         levels_of = _relative(evidence)
         share = level_shares(levels_of.likelihood)
         mean = np.asarray(share @ levels)
-        variance = float(share @ (levels - mean) ** 2)
+        variance = float(share @ (levels - mean) ** 2) * squared
         found = found._replace(
             background=total.ravel()[some].mean() - signal_share * mean,
             own_weight=_own_weight(total, chance + variance),
@@ -264,16 +294,19 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, _Sha
 
 def _completed(capture: Capture, found: FluxPrior, share: Floats) -> tuple[FluxPrior, _Shapes]:
     """Return `_flux_prior`, given the shares of the coarse grid of levels that `found` has."""
-    total, _, signal_share, spent = _totals(capture)
+    (total, has_signal, _), _, spent = _totals(capture)
+    signal_share = float(has_signal.mean())
     mean = signal_share * (share @ found.levels)
     levels, share, pair = _halved(found.levels, share, _kept(share))
     found = found._replace(levels=levels, share=share, background=total.mean() - mean)
-    pixels, density = _sampled_densities(capture, found, DEPTH_SAMPLE)
-    share, depth = shares_and_depths(density, found.share)
+    found, density, free = _with_depths(capture, found)
+    if found.background < mean and free.mean < total.mean():
+        # A small difference of large numbers: pixels without an echo seem to have a faint one.
+        found, density, free = _with_depths(
+            capture, found._replace(background=np.asarray(free.mean))
+        )
     # Given the delays, and one background for all levels, faint levels are less plausible.
-    likelihood = _evidence(density, depth).likelihood
-    found = found._replace(share=share, depth=depth)
-    free = _background(capture, found, pixels, density)
+    likelihood = _evidence(density, found.depth).likelihood
     share = level_shares(likelihood)
     learn_shares(likelihood, share)  # of the levels that are left
     levels, share = _joined(found.levels, share, pair)
@@ -288,20 +321,30 @@ def _completed(capture: Capture, found: FluxPrior, share: Floats) -> tuple[FluxP
         background = free.mean
         levels = levels * ((total.mean() - background) / (share @ levels))
     found = found._replace(levels=levels, share=share, background=np.asarray(background))
-    contrast = found.model(total, _least_background(capture)).contrast
+    contrast = flux_model_with(capture, found).contrast
     return found._replace(contrast=contrast), free.shapes
+
+
+def _with_depths(
+    capture: Capture, known: FluxPrior
+) -> tuple[FluxPrior, NDArray[np.float32], _Background]:
+    """Estimate the delays of a sample; return the prior with them, its densities and background."""
+    pixels, density = _sampled_densities(capture, known, DEPTH_SAMPLE)
+    share, depth = shares_and_depths(density, known.share)
+    found = known._replace(share=share, depth=depth)
+    return found, density, _background(capture, found, pixels, density)
 
 
 def _sampled_densities(
     capture: Capture, flux_prior: FluxPrior, n_pixels: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Return the flat indices of a sample of `n_pixels`, or fewer, and their `level_densities`."""
-    total, n_bins = _totals(capture)[0].ravel(), capture.acquisition.n_bins
+    n_bins = capture.acquisition.n_bins
     # A table of all levels and delays: fewer pixels in a long gate.
     n_levels = flux_prior.share.size
     most = sampled_numbers(n_levels, n_bins) // (n_levels * n_bins)
-    pixels = _sampled(total.size, min(most, n_pixels))
-    flux = flux_prior.model(total[np.newaxis, pixels], _least_background(capture))
+    pixels = _sampled(capture.counts.size, min(most, n_pixels))
+    flux = _model_of_pixels(capture, flux_prior, pixels, _least_background(capture))
     cube = capture.cube.reshape(-1, n_bins)[np.newaxis, pixels]
     return pixels, level_densities(prepare(capture, cube, flux, 1))
 
@@ -372,7 +415,7 @@ def _sampled(n_pixels: int, most: int) -> NDArray[np.intp]:
 
 def total_rates(capture: Capture) -> Floats:
     """Estimate the sum of signal and background of each pixel, shape (row, col)."""
-    return _totals(capture)[0]
+    return _totals(capture).of.rate
 
 
 def level_likelihoods(
@@ -394,11 +437,11 @@ def level_likelihoods(
     ndarray, shape (pixel, level)
         Without terms that depend only on the counts.
     """
-    some, n_bins, n_pulses = pixels[np.newaxis], capture.cube.shape[2], capture.gated_pulses
+    n_bins, n_pulses = capture.cube.shape[2], capture.gated_pulses
     # A mean background below half a count is known from many pixels.
     least = min(_least_background(capture), float(flux_prior.background))
-    flux = flux_prior.model(_totals(capture)[0].ravel()[some], least)
-    cube = capture.cube.reshape(-1, n_bins)[some]
+    flux = _model_of_pixels(capture, flux_prior, pixels, least)
+    cube = capture.cube.reshape(-1, n_bins)[np.newaxis, pixels]
     prepared = prepare(capture, cube, flux, steps_per_bin)
     evidence = level_evidence(prepared, prepared.depth)
     b, (node, node_weight) = flux.background[0, 0] / n_bins, nodes_of(flux.relative_background)
@@ -438,21 +481,19 @@ def _least_background(capture: Capture) -> float:
 
 
 class _Totals(NamedTuple):
-    """Total rates of the pixels of a capture."""
+    """Total rates of a capture."""
 
-    rate: Floats
-    """Shape (row, col)."""
+    of: Totals
+    """Those of its pixels."""
     chance: float
-    """Mean variance due to chance."""
-    signal_share: float
-    """Share of the pixels whose total includes their signal."""
+    """Mean of their variances due to chance."""
     spent: float
     """Share of the pixels of which nearly all pulses fired."""
 
 
 @cached_per_capture
 def _totals(capture: Capture) -> _Totals:
-    """Estimate the total rate of each pixel.
+    """Estimate the total rate of each pixel, or its background where that fires nearly all pulses.
 
     If u of M pulses do not fire, Coates' rates add up to ``ln(M / u)`` over the gate,
     and Greenwood's variances to ``1 / u - 1 / M``. The mean of the logarithm is biased; that of
@@ -460,16 +501,30 @@ def _totals(capture: Capture) -> _Totals:
     """
     n_pulses = capture.gated_pulses
     if n_pulses is None:
-        return _Totals(capture.counts.astype(float), float(capture.counts.mean()), 1.0, 0.0)
+        total = capture.counts.astype(float)
+        return _Totals(
+            _with_chance(total, np.ones(capture.shape, bool), total), float(total.mean()), 0.0
+        )
     unfired = np.maximum(n_pulses - capture.counts, 0)
     variance = 1 / np.maximum(unfired, 0.5) - 1 / n_pulses
     total = np.log((n_pulses + 0.5) / (unfired + 0.5))
-    spent, signal_share = capture.counts > n_pulses - _TOO_FEW, 1.0
+    has_signal, spent = np.ones(capture.shape, bool), capture.counts > n_pulses - _TOO_FEW
     if spent.any():
-        background = _background_of(capture.cube[spent], n_pulses)
-        signal_share -= np.count_nonzero(background > total[spent]) / total.size
-        total[spent] = np.maximum(total[spent], background)
-    return _Totals(total, float(variance.mean()), signal_share, float(spent.mean()))
+        # Chosen by the background: of pixels that are alike, chance leaves few pulses in some only.
+        some = capture.counts > n_pulses - _MARGIN * _TOO_FEW
+        background, most = _background_of(capture.cube[some], n_pulses), np.sqrt(variance[some])
+        most = background + _CLEARLY_MORE * most
+        has_signal[some] = (background < math.log(n_pulses / _TOO_FEW)) | (total[some] > most)
+        total[some] = np.where(has_signal[some], total[some], background)
+        variance[~has_signal] = _VARIANCE_OF_MEDIAN * total[~has_signal] ** 2 / n_pulses
+    pixels = _with_chance(total, has_signal, variance)
+    return _Totals(pixels, float(variance.mean()), float(spent.mean()))
+
+
+def _with_chance(total: Floats, has_signal: NDArray[np.bool_], variance: Floats) -> Totals:
+    """Return the totals of pixels of a known variance due to chance."""
+    mean = variance.mean() or 1.0
+    return Totals(total, has_signal, np.minimum(variance / mean, 1.0))
 
 
 def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats:
@@ -507,16 +562,22 @@ def _own_weight(total: Floats, unrelated: float) -> float:
     return 1 - unrelated / scatter if scatter > (1 + chance) * unrelated else 0.0
 
 
-def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture, shape: Floats | None) -> Floats:
-    """Signal levels: 0, and a geometric grid up to the strongest echoes of (pixel, bin)."""
-    top = _strongest(pixels, capture, shape)
+def _levels(
+    pixels: NDArray[np.intp], capture: Capture, shape: Floats | None, at_total: float | None
+) -> Floats:
+    """Signal levels: 0, and a geometric grid up to the strongest echoes of pixels."""
+    flat = capture.cube.reshape(-1, capture.cube.shape[2])
+    excess = _largest_excess(flat[pixels], capture, shape)
+    if at_total is not None:
+        excess *= at_total / np.maximum(_totals(capture).of.rate.ravel()[pixels], 1e-9 * at_total)
+    top = max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
     return np.concatenate([[0.0], np.geomspace(top / LEVEL_SPAN, top, LEVELS)])
 
 
-def _strongest(
+def _largest_excess(
     pixels: NDArray[np.unsignedinteger], capture: Capture, shape: Floats | None
-) -> float:
-    """Signal of the strongest echoes of pixels (pixel, bin), at least one detection."""
+) -> Floats:
+    """Largest excess of each pixel (pixel, bin) over its background in a window of an echo."""
     n_bins = pixels.shape[1]
     excess, width = np.empty(len(pixels)), min(capture.echo_bins, n_bins)
     for some in _some_rows(pixels):
@@ -526,7 +587,7 @@ def _strongest(
         if shape is not None:  # the background of each window, above the mean one
             inside -= until[:, -1:] * (windowed_sums(shape[np.newaxis], width) - width) / n_bins
         excess[some] = inside.max(axis=1) - until[:, -1] * width / n_bins
-    return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
+    return excess
 
 
 def _halved(

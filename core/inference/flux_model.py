@@ -27,6 +27,9 @@ UNRELATED = Agreement(0.0, 0.0, 1.0)
 """Agreement of an image whose neighbouring pixels carry no information about each other."""
 
 
+_LEAST_BRIGHTNESS = 0.3
+
+
 @dataclass(frozen=True, eq=False)
 class FluxModel:
     """Possible fluxes of each pixel: signal levels, and how often each occurs.
@@ -95,6 +98,25 @@ class FluxModel:
         )
 
 
+class Totals(NamedTuple):
+    """Total rates of the pixels of an image, photons per pulse and gate, shape (row, col) each."""
+
+    rate: Floats
+    """Estimate."""
+    has_signal: NDArray[np.bool_]
+    """Whether it includes the signal of its pixel."""
+    chance: Floats
+    """Its variance due to chance, relative to the mean over the image, and 1 at most."""
+
+    def of_pixels(self, pixels: NDArray[np.intp]) -> Totals:
+        """Return the totals of some pixels, given as flat indices, in one row."""
+        return Totals(
+            self.rate.ravel()[np.newaxis, pixels],
+            self.has_signal.ravel()[np.newaxis, pixels],
+            self.chance.ravel()[np.newaxis, pixels],
+        )
+
+
 class FluxPrior(NamedTuple):
     """Flux parameters shared by all pixels of an image; with its counts they give a `FluxModel`."""
 
@@ -107,18 +129,32 @@ class FluxPrior(NamedTuple):
     background: Floats
     """Mean background over the image; per level while the signals are unknown."""
     own_weight: float
-    """Share of a pixel's deviation from the mean background that is not chance."""
+    """Share of a pixel's deviation from the mean background that is not chance; a larger one of
+    pixels with less chance."""
     contrast: float | None = None
     """`FluxModel.contrast` of the image."""
     pile_up: bool = True
     """`FluxModel.pile_up`."""
     background_shape: Floats | None = None
     """`FluxModel.background_shape`."""
+    at_total: float | None = None
+    """Total rate of a pixel with signals of `levels`; those of others are in proportion to theirs,
+    as where a surface reflects signal and sunlight alike. None if signals do not depend on it."""
 
     @property
     def relative_background(self) -> Floats:
         """`background_shape`, or 1 in each bin."""
         return _ones_unless(self.background_shape, self.depth)
+
+    def brightness(self, total: Floats) -> Floats:
+        """Return the signals of pixels relative to `levels`, given their total rates, any shape.
+
+        Of dark pixels at least `_LEAST_BRIGHTNESS`: with less, no count would speak against an echo
+        where there is no surface, as in the sky.
+        """
+        if self.at_total is None:
+            return np.ones_like(total)
+        return np.maximum(total / self.at_total, _LEAST_BRIGHTNESS)
 
     def with_one_level(self) -> FluxPrior:
         """Return the prior with all signal levels replaced by their mean."""
@@ -126,16 +162,19 @@ class FluxPrior(NamedTuple):
         mean = float(self.share[1:] @ self.levels[1:] / some)
         return self._replace(levels=np.array([0.0, mean]), share=np.array([self.share[0], some]))
 
-    def model(self, total: Floats, least_background: float) -> FluxModel:
-        """Return the fluxes of pixels with known total rates, shape (row, col)."""
+    def model(self, totals: Totals, least_background: float) -> FluxModel:
+        """Return the fluxes of pixels with known total rates."""
+        total, has_signal, chance = totals
         shape, levels = (self.levels.size, *total.shape), self.levels[:, np.newaxis, np.newaxis]
         mean = np.broadcast_to(self.background, levels.shape)
+        if self.at_total is not None:
+            levels = levels * self.brightness(total)
         if self.own_weight == 0:  # one number per level
             background = np.broadcast_to(np.maximum(mean, least_background), shape)
         else:
-            background = np.empty(shape)
+            weight, background = 1 / (1 + (1 / self.own_weight - 1) * chance), np.empty(shape)
             for level, its_mean, filled in zip(levels, mean, background, strict=True):
-                own = its_mean + self.own_weight * (total - level - its_mean)
+                own = its_mean + weight * (total - level * has_signal - its_mean)
                 np.maximum(own, least_background, out=filled)
         return FluxModel(
             np.broadcast_to(levels, shape),

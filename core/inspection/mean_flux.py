@@ -6,7 +6,8 @@ over uniform delays, give a likelihood of mean signal and mean background, maxim
 shape, and profile likelihood intervals as for a single pixel (`core.inspection.flux`).
 
 Where pixels differ in their backgrounds, the likelihood only gives the signal; the mean background
-is what it leaves of the total.
+is what it leaves of the total. Where signals are in proportion to the totals
+(`core.inference.flux`), the gamma distribution is that of the signal of a mean total.
 
 The maximum-likelihood gamma distribution has the mean of the observed signals, whatever their
 true distribution, so that the model need not be exact where signals are clear.
@@ -253,7 +254,8 @@ def _unresolved(capture: Capture) -> FluxEstimate:
 
 def _dimmer(capture: Capture) -> tuple[Capture, float]:
     """Reduce the pulses of a capture whose echoes are brighter than the mean requires."""
-    strongest = float(detailed_flux_prior_of(capture).levels[-1])
+    known = detailed_flux_prior_of(capture)
+    strongest = float(known.levels[-1] * known.brightness(total_rates(capture)).max())
     share = _BRIGHT / max(strongest * (capture.gated_pulses or 1), _BRIGHT)
     return (share_of_pulses(capture, share), share) if share < 1 else (capture, 1.0)
 
