@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.estimators import RangeImage, estimate
+from core.estimators import RangeImage, estimate, with_returns
 from core.inference.fit import Fit, fit_in
 from core.inference.posterior import same_echo_bins
 from core.inspection.mean_flux import METHOD, mean_flux_of, selected_pixels
@@ -113,14 +113,24 @@ def region_report(
 def _ranged(summed: Capture, method: str, settings: Any) -> RangeImage:
     """Estimate the sum with two returns, unless these may be one surface that slopes.
 
-    Within the region a slope widens its echo, and two returns closer than an echo fit it better.
+    Within the region a slope widens its echo, and two returns closer than an echo fit it better. Of
+    two returns, the estimate is the one that the method finds, not the stronger one.
     """
-    found = estimate(summed, method, settings, returns=2)
+    alone = estimate(summed, method, settings)
+    found = with_returns(summed, alone)
     assert found.returns is not None
     bins = found.returns.bin
-    if bins.size > 1 and np.ptp(bins) < same_echo_bins(summed):
-        return estimate(summed, method, settings)
-    return found
+    if bins.size < 2:
+        return found
+    if np.ptp(bins) < same_echo_bins(summed):
+        return alone
+    nearest = np.abs(bins - alone.bin.item()).argmin()
+    return replace(
+        found,
+        range_m=found.returns.range_m[nearest].reshape(1, 1),
+        bin=bins[nearest].reshape(1, 1),
+        confidence=found.returns.confidence[nearest].reshape(1, 1),
+    )
 
 
 def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:

@@ -359,6 +359,20 @@ def test_a_dark_surface_between_bright_ones_is_not_dead() -> None:
     assert [(each.row, each.col) for each in found if each.health == "dead"] == [(5, 6)]
 
 
+@pytest.mark.parametrize("method", ["tracking", "likelihood", "coates"])
+def test_the_estimate_of_a_region_with_two_surfaces_is_what_the_method_finds(method: str) -> None:
+    scene = scenes["car"]()
+    capture = simulate(scene, scene.acquisition, Flux(), seed=0)
+    mask = np.zeros(capture.shape, bool)
+    mask[20:41, 10:51] = True
+    report = inspection.region_report(capture, estimate(capture, method), mask, method)
+    assert report.image.returns is not None and len(report.image.returns) == 2
+    alone = estimate(report.summed, method).bin.item()
+    others = [abs(each.bin - alone) for each in report.pixel.candidates]
+    best = report.pixel.candidates[int(np.argmin(others))]
+    assert report.image.bin.item() == best.bin
+
+
 def test_pixels_of_a_dead_column_are_dead_but_not_those_of_a_night_sky() -> None:
     scene = random_depths(24, seed=1)
     capture = simulate(scene, replace(scene.acquisition, n_pulses=500), Flux(0.1, sbr=0.1), seed=0)
