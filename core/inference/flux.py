@@ -418,6 +418,19 @@ def total_rates(capture: Capture) -> Floats:
     return _totals(capture).of.rate
 
 
+def background_in_strong_sun(capture: Capture) -> tuple[float, float] | None:
+    """Mean background of the pixels, and its standard deviation due to chance.
+
+    None if all totals include the signals of their pixels, of which the background is what these
+    leave.
+    """
+    totals = _totals(capture)
+    if totals.of.has_signal.all():
+        return None
+    mean = float(detailed_flux_prior_of(capture).background)
+    return mean, math.sqrt(totals.chance / totals.of.rate.size)
+
+
 def level_likelihoods(
     capture: Capture, pixels: NDArray[np.intp], flux_prior: FluxPrior, steps_per_bin: int
 ) -> Floats:
@@ -540,6 +553,8 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
     median = np.empty(len(pixels))
     for some in _some_rows(pixels):
         rate, armed = rate_and_n_armed(pixels[some].astype(float), n_pulses)
+        # The median of a Poisson variable is about 1/3 less than its mean.
+        rate += 1 / (3 * np.maximum(armed, 1))
         median[some] = weighted_median(rate.T, armed.T)
     at_once = pixels[:, 0] >= n_pulses
     median[at_once] = math.log(2 * n_pulses * max(int(at_once.sum()), 1))

@@ -27,7 +27,7 @@ UNRELATED = Agreement(0.0, 0.0, 1.0)
 """Agreement of an image whose neighbouring pixels carry no information about each other."""
 
 
-_LEAST_BRIGHTNESS = 0.3
+_LEAST_BRIGHTNESS = 0.25
 
 
 @dataclass(frozen=True, eq=False)

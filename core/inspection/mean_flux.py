@@ -40,6 +40,7 @@ from core.capture import Capture, cached_per_capture
 from core.inference.faults import ordinary_pixels
 from core.inference.flux import (
     SAMPLE,
+    background_in_strong_sun,
     detailed_flux_prior_of,
     level_likelihoods,
     total_rates,
@@ -60,6 +61,7 @@ METHOD = (
 
 _Fit = Callable[[Floats, Floats], Floats]
 
+_SIGMAS = float(scipy.special.ndtri(0.5 + LEVEL / 2))
 _SAMPLE = 512  # pixels
 _FEW = 24  # pixels, too few to estimate the scatter of the signals
 _DARK = 30  # photons in all, too few to separate signal and background
@@ -145,7 +147,12 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     mixture, scale = _Mixture(some), 1.0 if acquisition.n_pulses else 1 / share
     model, target = (each.of(some).scaled(scale) for each in (mixture.image, mixture.target))
     total = total_flux(ordinary)
-    if mixture.has_own_backgrounds and total is not None:
+    known = background_in_strong_sun(ordinary)
+    if mixture.has_own_backgrounds and known is not None:
+        mean, half = known[0], _SIGMAS * known[1]
+        background = Interval(mean, mean - half, mean + half)
+        whole = FluxEstimate(model.signal, background, ratio_of(model.signal, background))
+    elif mixture.has_own_backgrounds and total is not None:
         whole = _below_total(model.signal, total)
     else:
         whole = _with_total(model, total)
@@ -286,7 +293,7 @@ class _Mixture:
         )
         mean = max(float(known.share @ known.levels), top / 1e3)
         bright = max(mean / float(known.share[1:].sum()), mean)
-        background = max(float(total.mean()) - mean, 0.5 / n_pulses)
+        background = max(float(known.background), 0.5 / n_pulses)
         chance = math.sqrt(float(total.mean()) / n_pulses / pixels.size)
         half = min(4 * chance / background, 1.0)
         if capture.gated_pulses is not None and total.size >= 2 * _SAMPLE:

@@ -26,6 +26,7 @@ from core.inference.faults import outlier_pixels, pixel_verdict, probability_of_
 from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.maps import likeliest
+from core.inspection.mean_flux import mean_flux_of
 from core.inspection.profile import Box as Bounds
 from core.inspection.profile import difference_of, ratio_of, zoomed
 from core.metrics import Interval, restored
@@ -357,6 +358,24 @@ def test_a_dark_surface_between_bright_ones_is_not_dead() -> None:
     broken[5, 6] = 0
     found = inspection.faulty_pixels(replace(capture, cube=broken))
     assert [(each.row, each.col) for each in found if each.health == "dead"] == [(5, 6)]
+
+
+@pytest.mark.parametrize("reflectivity", [(1.0, 1.0), (0.15, 1.0)])
+def test_mean_fluxes_in_strong_sun_are_right(reflectivity: tuple[float, float]) -> None:
+    """Nearly all pulses of the brighter pixels fire before the echo of a far wall."""
+    shape, signal, background = (24, 24), 0.5, 8.0
+    factor = np.random.default_rng(1).choice(reflectivity, shape)
+    acquisition = Acquisition()
+    onset_bin = np.where(np.arange(24) < 12, 30.4, 70.7) * np.ones(shape)
+    rate = rate_per_bin(onset_bin, signal * factor, 0.0, Pulse(), acquisition)
+    rate += background * factor[..., np.newaxis] / acquisition.n_bins
+    for seed in range(4):
+        counts = draw_counts(rate, acquisition.n_pulses, np.random.default_rng(seed))
+        found = mean_flux_of(Capture(counts, acquisition))
+        assert found.pulse == Pulse()
+        mean = factor.mean()
+        assert found.image.signal.value == pytest.approx(signal * mean, rel=0.1)
+        assert found.image.background.value == pytest.approx(background * mean, rel=0.02)
 
 
 @pytest.mark.parametrize("method", ["tracking", "likelihood", "coates"])
