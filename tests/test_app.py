@@ -20,7 +20,7 @@ from app.model.capture_defaults import enter
 from app.model.glossary import linked
 from app.model.range_prior import range_prior_of
 from app.model.script import script_of
-from app.model.state import Illumination, ReductionSettings, State, Viewing
+from app.model.state import ALL_RETURNS, Illumination, ReductionSettings, State, Viewing
 from app.model.store import (
     built_in_sources,
     compute,
@@ -695,6 +695,19 @@ def test_every_source_is_estimated_and_drawn(layout, explore):
         assert explore.image.figure.title.text
         if key in ("car", "sample"):  # with truth, and without
             draw_in_every_way(layout, explore)
+    assert {*layout.heard} == {""}
+
+
+def test_another_scene_or_capture_keeps_the_method_and_what_it_shows(layout):
+    kept = {"method": "likelihood", "judged_by": "image", "returns": ALL_RETURNS}
+    layout.session.state.param.update(kept)
+    layout.next_answer()
+    for key in ("staircase", "sample"):
+        control(layout, "Scene or capture").value = key
+        request = layout.next_answer().request
+        assert request.source is layout.session.sources[key]
+        assert {name: getattr(request, name) for name in kept} == kept
+    layout.settle()
     assert {*layout.heard} == {""}
 
 

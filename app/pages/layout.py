@@ -584,6 +584,8 @@ class Layout:
                 ReductionSettings(),
                 state.method,
                 state.settings,
+                state.judged_by,
+                state.returns,
                 budget=state.budget,
             )
             state.param.update(parameters_of(request, session.sources))
