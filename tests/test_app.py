@@ -22,6 +22,7 @@ from app.model.range_prior import range_prior_of
 from app.model.script import script_of
 from app.model.state import ALL_RETURNS, Illumination, ReductionSettings, State, Viewing
 from app.model.store import (
+    Source,
     built_in_sources,
     compute,
     file_source,
@@ -459,6 +460,19 @@ def test_axes_follow_another_gate(car, small_file):
     start_m, step_m = 149.896229, 0.299792458
     metres = views.histogram.figure.above[0].formatter.args
     assert (metres["origin"], metres["step"]) == pytest.approx((start_m, step_m))
+
+
+def test_a_pixel_without_photons_has_axes(car):
+    cube = car.capture.cube.copy()
+    cube[3, 4] = 0
+    unlit = replace(car.capture, cube=cube, signal=None, background=None)
+    source = Source("unlit", lambda _: unlit)
+    dark = compute(ask(source, method="tracking"), None)
+    views = SignalPlots()
+    views.update(inspect(dark, 3, 4), dark.gate, with_difference=True)
+    for plot in (views.histogram, views.residual, views.enhanced):
+        ends = plot.figure.y_range
+        assert (ends.start, ends.end) == (0, 1), plot.figure.title.text
 
 
 def legend(plot):

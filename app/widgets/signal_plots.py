@@ -167,7 +167,7 @@ class SignalPlots:
     def _frame(self, plot: Plot, pixel: Pixel, low: float, *curves: Array) -> None:
         """Fit the vertical axis, and draw the lines of truth and estimate."""
         highest = max(float(np.nanmax(curve, initial=0.0)) for curve in curves)
-        end = round_up(highest * 1.15)
+        end = round_up(highest * 1.15) or 1.0
         fit(plot.figure, -round_up(-low * 1.05), end)
         self._mark(plot, pixel, 0.0, end)
 
