@@ -97,9 +97,19 @@ PARTS = {
 """Optional parts of a scene: names of its fields and how texts call them."""
 
 
+PLAIN_PARTS = ("reflectivity", "falloff")
+"""Parts with which a pixel still sees one echo over uniform background, so that its signal and
+background state all its fluxes."""
+
+
 def parts_of(scene: Scene) -> tuple[str, ...]:
     """Return the names of the `PARTS` that a scene has."""
     return tuple(part for part in PARTS if getattr(scene, part) is not None)
+
+
+def further_parts_of(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the parts other than `PLAIN_PARTS` that a scene has."""
+    return tuple(part for part in parts_of(scene) if part not in PLAIN_PARTS)
 
 
 def without(scene: Scene, *parts: str) -> Scene:

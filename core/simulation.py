@@ -27,7 +27,7 @@ from core.checks import require, require_type
 from core.kernels.parallel import on_threads
 from core.kernels.simulate import SHAPE_CODES, add_echo_photons, fire_once
 from core.pulse_groups import PulseGroups, group_sizes
-from core.scene import Scene, parts_of
+from core.scene import Scene, further_parts_of
 from core.trigger import EXPONENTIAL, add_triggers, count_dtype, draw_triggers, to_probability
 
 _Flux = TypeVar("_Flux", float, Floats)
@@ -91,7 +91,7 @@ def simulate(
     else:
         triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
         cube = draw_triggers(triggered, n_pulses, seed)
-    is_plain = set(parts_of(scene)) <= {"reflectivity", "falloff"}
+    is_plain = not further_parts_of(scene)
     source = f"simulated, seed {seed}, SBR {flux.sbr:g}, PPP {flux.signal:g}"
     return Capture(
         cube.reshape(*shape, acquisition.n_bins),

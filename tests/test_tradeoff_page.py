@@ -254,6 +254,26 @@ def test_the_simulation_can_be_cancelled(session):
         AcquisitionSection(session).work()(cancelled)
 
 
+def test_a_study_that_failed_says_so_and_starts_with_another_scene(session, monkeypatch):
+    def fail(*_, **__):
+        raise ValueError("Not today.")
+
+    with monkeypatch.context() as failing:
+        failing.setattr("app.pages.tradeoff.acquisition.acquisition_sweeps", fail)
+        section = AcquisitionSection(session)
+        session.estimate.changed.subscribe(section.follow)
+        section.show(True)
+        assert section.subject.text == text.NOT_SIMULATED
+        session.tasks.run_until(lambda: section.study.has_failed)
+        assert section.subject.text == text.FAILED
+        change(session, method="peak")  # of the same scene
+        assert section.subject.text == text.FAILED
+    change(session, source="wall")
+    assert section.subject.text == text.NOT_SIMULATED
+    session.tasks.run_until(lambda: "captures" in section.study.sentence.text)
+    section.study.cancel()
+
+
 # -- ablation --------------------------------------------------------------------------------------
 
 

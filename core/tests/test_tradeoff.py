@@ -21,6 +21,7 @@ from core import estimators
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.cli import main
+from core.effects import Jitter
 from core.estimators import ESTIMATORS
 from core.io.writers import save_capture
 from core.metrics import Interval
@@ -29,6 +30,7 @@ from core.reductions import Reduction
 from core.scene import PAPER_GATE, Scene, scenes
 from core.simulation import simulate
 from core.studies import trials
+from core.studies.outputs import Plot, Table
 from core.studies.tradeoff import acquisition as acquiring
 from core.studies.tradeoff import measure
 from core.studies.tradeoff import plan as plans
@@ -43,7 +45,7 @@ from core.studies.tradeoff.measure import (
     study,
     variations,
 )
-from core.studies.tradeoff.page import acquisition_sweeps
+from core.studies.tradeoff.page import acquisition_items, acquisition_sweeps
 from core.studies.tradeoff.pareto import (
     best_within,
     by_condition,
@@ -522,6 +524,31 @@ def test_gates_hold_the_targets_and_keep_the_background_per_bin(car: Simulation)
         per_bin = each.flux.background / each.acquisition.n_bins
         assert per_bin == pytest.approx(car.flux.background / 100)
         assert each.flux.signal == car.flux.signal
+
+
+@pytest.mark.compiled
+def test_the_oracle_is_left_out_where_the_fluxes_are_not_known(
+    monkeypatch: pytest.MonkeyPatch, car: Simulation
+) -> None:
+    monkeypatch.setattr(acquiring, "PULSES", (50, 500))
+    monkeypatch.setattr(acquiring, "EXPOSURES", (0.5, 1.0))
+    monkeypatch.setattr(acquiring, "GATES", 2)
+    worn = replace(car, name="worn", scene=replace(car.scene, jitter=Jitter(1e-9)))
+    assert worn.capture(0).signal is None
+    sweeps = acquisition_sweeps([car, worn], (0, 1))
+    assert [[*each.gate.simulated] for each in sweeps] == [["oracle", "likelihood"], ["likelihood"]]
+    *plots, required = acquisition_items(sweeps)
+    assert isinstance(required, Table)
+    at = required.columns.index("oracle, simulated [95 %]")
+    assert {bool(row[at]) for row in required.rows if row[0] == "worn"} == {False}
+    assert all(row[at] for row in required.rows if row[0] == "car")
+    for item in plots[3:]:
+        assert isinstance(item, Plot)
+        assert [*item.curves] == ["theory, flux known", "likelihood, simulated"]
+        assert "It leaves out: timing jitter." in item.note
+    *_, alone = acquisition_items(sweeps[1:])
+    assert isinstance(alone, Table)
+    assert not any("oracle" in name for name in alone.columns)
 
 
 def test_the_best_exposure_is_the_best_by_theory(car: Simulation) -> None:

@@ -126,8 +126,15 @@ class OnePiece(_ControlledWork, Generic[Result]):
         Shows the result on the page.
     noun : str
         Unit of the progress.
+    failed : callable
+        Called after a failure has been reported.
     **start : str
         ``label`` and ``help`` of the button that starts it.
+
+    Attributes
+    ----------
+    has_failed : bool
+        Whether the last work failed.
     """
 
     def __init__(
@@ -136,17 +143,20 @@ class OnePiece(_ControlledWork, Generic[Result]):
         work: Callable[[], Work[Result]],
         draw: Callable[[Result], None],
         noun: str,
+        failed: Callable[[], None] = lambda: None,
         **start: str,
     ) -> None:
         super().__init__(session, noun, **start)
         self._make_work = work
         self._draw = draw
-        self._starts_by_itself = True
+        self._after_failure = failed
+        self._starts_by_itself, self.has_failed = True, False
 
     def start(self, work: Work[Result] | None = None) -> None:
         """Start this work, or that for the present settings, in place of the present work."""
-        self._starts_by_itself = False
+        self.has_failed = False
         work = work or self._make_work()
+        self._starts_by_itself = False
         self._session.failures.resolve(self)
         self._work.start_piece(work, self._draw)
 
@@ -165,13 +175,19 @@ class OnePiece(_ControlledWork, Generic[Result]):
             self._session.failures.resolve(self)
             self._work.start_piece(self._make_work(), self._draw_first)
 
+    def retry(self) -> None:
+        """Let work that has failed start by itself again: its subject has changed."""
+        if self.has_failed:
+            self._starts_by_itself, self.has_failed = True, False
+
     def _draw_first(self, result: Result) -> None:
         self._starts_by_itself = False
         self._draw(result)
 
     def _failed(self, error: Exception) -> None:
-        self._starts_by_itself = False
+        self._starts_by_itself, self.has_failed = False, True
         super()._failed(error)
+        self._after_failure()
 
 
 def aside(explanation: str, *controls: Any) -> pn.Column:

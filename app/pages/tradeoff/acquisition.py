@@ -7,7 +7,7 @@ from typing import Any
 
 import panel as pn
 
-from app.model.store import Answer, Request
+from app.model.store import Answer, Request, same_subject
 from app.pages.navigation import HOLDER
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
@@ -53,7 +53,9 @@ class AcquisitionSection(SettingsSection[Repetitions]):
 
     def __init__(self, session: Session) -> None:
         super().__init__(session, Repetitions(), text.ACQUISITION)
-        self.study = OnePiece(session, self.work, self.draw, "captures")
+        self.study = OnePiece(
+            session, self.work, self.draw, "captures", failed=self._describe_waiting
+        )
         self.subject = Sentence(
             text=text.NOT_SIMULATED, live=True, sizing_mode="stretch_width", margin=(4, 8)
         )
@@ -63,7 +65,7 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         self._results = pn.Column(
             visible=False, stylesheets=[HOLDER], sizing_mode="stretch_width", margin=0
         )
-        self._simulated = session.answer.request
+        self._simulated = self._tried = session.answer.request
         for each in self.cards:
             each.offer(session, self.about)
         self._required.offer(session, self.about)
@@ -90,10 +92,20 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         self._start_first()
 
     def _start_first(self) -> None:
-        applies = _applies(self.session.answer)
-        if not self._results.visible:
-            self.subject.text = text.NOT_SIMULATED if applies else text.FIRST_PHOTONS_ONLY
-        self.study.show(self.is_on_screen and applies)
+        answer = self.session.answer
+        if not same_subject(answer.request, self._tried):
+            self.study.retry()
+        self._describe_waiting()
+        self.study.show(self.is_on_screen and _applies(answer))
+
+    def _describe_waiting(self) -> None:
+        """State what happens before there are results."""
+        if self._results.visible:
+            return
+        if not _applies(self.session.answer):
+            self.subject.text = text.FIRST_PHOTONS_ONLY
+        else:
+            self.subject.text = text.FAILED if self.study.has_failed else text.NOT_SIMULATED
 
     def about(self) -> Subject:
         """Return what the section's files are about."""
@@ -105,6 +117,8 @@ class AcquisitionSection(SettingsSection[Repetitions]):
             raise ValueError(text.FIRST_PHOTONS_ONLY)
         request, source = self.session.answer.request, source_of(self.session.answer)
         repetitions = self.settings.repetitions
+        self._tried = request
+        self._describe_waiting()
 
         def work(progress: Callable[[int, int], None]) -> tuple[Request, str, list[Any]]:
             affordable(source, ())

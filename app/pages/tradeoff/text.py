@@ -154,12 +154,14 @@ def _recommended(goal: str, found: Recommendation | None, keeps: str) -> str:
 ACQUISITION = """
 Number of pulses, flux and length of the gate that reach a restoration degree: from theory, for
 the likeliest delay with known fluxes; and from simulation, for the likelihood with known and with
-estimated fluxes. Below each plot: the error of the theory, and what it assumes.
+estimated fluxes. Fluxes are known where pixels see one echo over uniform background. Below each
+plot: the error of the theory, and what it assumes.
 """
 NOT_SIMULATED = (
     "25 acquisitions of this scene are simulated, which takes up to half a minute. The sidebar "
     "shows the progress; Cancel stops it, Compute starts it again."
 )
+FAILED = "The study could not be completed. Press Compute to run it again."
 FIRST_PHOTONS_ONLY = (
     "This study varies pulses and flux of first-photon data. This capture holds all photons, or "
     "its number of pulses is not known: choose a scene or another capture."

@@ -16,6 +16,7 @@ import scipy  # loads a submodule when it is first used
 from core.acquisition import Floats, Flux
 from core.inference.limits import best_exposure, right_bin_probability
 from core.metrics import Interval
+from core.scene import further_parts_of
 from core.simulation import echoes
 from core.studies.tradeoff.measure import Candidate, Piece, scored
 from core.studies.tradeoff.surrogate import Simulation
@@ -42,7 +43,7 @@ class Sweep:
         Probability of the right bin (within 3.2 bins for the paper's pulse), mean over the targets,
         with known signal and background.
     simulated : mapping
-        Restoration degree within 3 bins of each of `METHODS`, with 95 % intervals.
+        Restoration degree within 3 bins of each of `methods_for`, with 95 % intervals.
     """
 
     x: Floats
@@ -123,6 +124,11 @@ def _targets(simulation: Simulation) -> tuple[Floats, Floats]:
     return onset[sample], signal[sample]
 
 
+def methods_for(simulation: Simulation) -> tuple[str, ...]:
+    """Return those of `METHODS` that apply: the oracle needs fluxes that the captures state."""
+    return METHODS[1:] if further_parts_of(simulation.scene) else METHODS
+
+
 def sweeps(
     varied: Sequence[tuple[Sequence[float], Sequence[Simulation]]],
     *,
@@ -142,18 +148,18 @@ def sweeps(
     progress : callable
         ``(captures ranged, captures in all)``.
     """
-    methods = {each.name: Candidate(each) for each in default_methods() if each.name in METHODS}
-    configurations = tuple(methods[name] for name in METHODS)
+    candidates = {each.name: Candidate(each) for each in default_methods() if each.name in METHODS}
     all_simulations = [each for _, simulations in varied for each in simulations]
+    chosen = [methods_for(each) for each in all_simulations]
     pieces = [
-        Piece(place, simulation, configurations, seed)
+        Piece(place, simulation, tuple(candidates[name] for name in chosen[place]), seed)
         for place, simulation in enumerate(all_simulations)
         for seed in seeds
     ]
-    scores: dict[str, list[list[Score]]] = {name: [[] for _ in all_simulations] for name in METHODS}
+    scores: list[dict[str, list[Score]]] = [{name: [] for name in names} for names in chosen]
     for done, (piece, found) in enumerate(mapped(scored, pieces, processes)):
-        for name, each in zip(METHODS, found, strict=True):
-            scores[name][piece.place] += each
+        for name, each in zip(chosen[piece.place], found, strict=True):
+            scores[piece.place][name] += each
         progress(done + 1, len(pieces))
     ends = np.cumsum([len(x) for x, _ in varied])
     return [
@@ -161,8 +167,8 @@ def sweeps(
             np.asarray(x, float),
             np.array([theory(each) for each in simulations]),
             {
-                name: tuple(summary(s).rd[2] for s in scores[name][end - len(x) : end])
-                for name in METHODS
+                name: tuple(summary(each[name]).rd[2] for each in scores[end - len(x) : end])
+                for name in chosen[end - 1]
             },
         )
         for (x, simulations), end in zip(varied, ends, strict=True)

@@ -16,6 +16,7 @@ from core.acquisition import Floats
 from core.checks import require
 from core.inference.limits import ACCURACY, ASSUMES
 from core.metrics import Interval
+from core.scene import PARTS, further_parts_of
 from core.studies.outputs import Item, Plot, Scatter, Table, as_text, table
 from core.studies.statistics import mean_interval, median_interval
 from core.studies.timing import machine
@@ -370,6 +371,13 @@ acquired, acquiring_items = acquisition_sweeps, acquisition_items
 _THEORY = f"Theory: {ASSUMES}, {ACCURACY}. Other methods may exceed it."
 
 
+def _theory_of(*simulations: Simulation) -> str:
+    """State what the theory assumes, and which parts of the scenes it leaves out."""
+    further = {part for each in simulations for part in further_parts_of(each.scene)}
+    left_out = ", ".join(title for part, title in PARTS.items() if part in further)
+    return f"{_THEORY} It leaves out: {left_out}." if left_out else _THEORY
+
+
 def _sweep_plot(
     name: str, simulation: Simulation, sweep: Sweep, x_label: str, marks: dict[str, float]
 ) -> Plot:
@@ -386,7 +394,7 @@ def _sweep_plot(
         sweep.x,
         {"theory, flux known": sweep.theory, **{key: each[0] for key, each in ends.items()}},
         marks,
-        f"{_THEORY} Bands: 95 % sampling error.",
+        f"{_theory_of(simulation)} Bands: 95 % sampling error.",
         bands={key: (each[1], each[2]) for key, each in ends.items()},
         x_is_log=True,
     )
@@ -401,12 +409,20 @@ def _required_pulses(sweeps: Sequence[AcquisitionSweeps]) -> Table:
     def simulated(method: str) -> Callable[[tuple[AcquisitionSweeps, float]], str]:
         def text(row: tuple[AcquisitionSweeps, float]) -> str:
             swept, rd = row[0].pulses, row[1]
+            if method not in swept.simulated:
+                return ""
             found = astuple(acquisition.pulses_by_simulation(swept, method, rd))
             value, low, high = (whole(n, swept.x) for n in found)
             return f"{value} [{low}, {high}]"
 
         return text
 
+    methods = [
+        name
+        for name in acquisition.METHODS
+        if any(name in each.pulses.simulated for each in sweeps)
+    ]
+    theory = _theory_of(*(each.simulation for each in sweeps))
     return table(
         "required_pulses",
         "Pulses required for a restoration degree within 3 bins",
@@ -418,9 +434,9 @@ def _required_pulses(sweeps: Sequence[AcquisitionSweeps]) -> Table:
             "theory, flux known": lambda row: whole(
                 acquisition.pulses_by_theory(row[0].simulation, row[1]), row[0].pulses.x
             ),
-            **{f"{name}, simulated [95 %]": simulated(name) for name in acquisition.METHODS},
+            **{f"{name}, simulated [95 %]": simulated(name) for name in methods},
         },
-        f"{_THEORY} Simulated: interpolated between the numbers of pulses of the sweep.",
+        f"{theory} Simulated: interpolated between the numbers of pulses of the sweep.",
     )
 
 
