@@ -83,6 +83,19 @@ def test_files_that_differ_in_numbers_open_as_one_sequence_and_others_one_by_one
     assert titles[-3:] == ["run_*_a.npz", "day.npz", "night.npz"]
 
 
+def test_a_file_is_read_or_refused_by_its_content_whatever_its_name(content):
+    layout = HeldLayout(built_in_sources(), uploads=Uploads())
+    button, before = control(layout, "Open a capture file"), layout.session.answer
+    assert not button.accept  # else the browser drops other files without a message
+    button.param.update(filename=["notes.txt"], value=[b"nothing of the kind"])
+    assert layout.next_answer() is before
+    assert "notes.txt" in layout.alert.text
+    assert "still shows the last settings" in layout.alert.text
+    button.param.update(filename=["capture.dat"], value=[content])
+    assert layout.next_answer().request.source.title == "capture.dat"
+    assert layout.alert.text == ""
+
+
 def test_the_question_about_an_upload_is_asked_again_after_a_reload(tmp_path):
     cube = np.ones((4, 6, 37), np.uint8)
     np.savez(tmp_path / "two.npz", spad=cube, rates=cube / 7)

@@ -14,9 +14,6 @@ from core.io import PossibleTruth, possible_truths, truth_options_from
 
 _BETWEEN = "|"
 
-SUFFIXES = (".npy", ".npz", ".mat", ".tif", ".tiff", ".nc", ".h5", ".hdf5")
-"""Suffixes of files that may hold true ranges, for the file dialog."""
-
 
 @dataclass(frozen=True)
 class Truth:

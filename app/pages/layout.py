@@ -50,7 +50,7 @@ from app.widgets.glossary import Glossary, explained
 from app.widgets.share import Share
 from app.widgets.tour import SCENE, Tour
 from core import PRESETS, TrackingParameters
-from core.io import SUFFIXES, ReadOptions, pattern_of
+from core.io import ReadOptions, pattern_of
 
 CUSTOM = "custom"
 EXPLORE, LEARN = "Explore", "Learn"
@@ -295,7 +295,6 @@ class Layout:
         self._source.css_classes = [SCENE]
         self._file = file_button(
             "Open a capture file",
-            SUFFIXES,
             self._upload,
             lambda reason: session.failures.show(text.not_uploaded(reason, MAX_UPLOAD_BYTES)),
             multiple=True,

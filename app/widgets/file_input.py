@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import panel_material_ui as pmui
@@ -22,18 +22,18 @@ _LONGEST_NAME = 1024
 
 def file_button(
     label: str,
-    suffixes: Iterable[str],
     receive: Callable[[dict[str, bytes]], None],
     complain: Callable[[str], None],
     multiple: bool = False,
 ) -> FileInput:
     """Return a button that opens a file, or several at once.
 
+    Files of any name are received, since readers choose by content: a browser would drop others
+    without a message.
+
     Parameters
     ----------
     label : str
-    suffixes : iterable of str
-        For the dialog that it opens.
     receive : callable
         Called with the contents of the files by name.
     complain : callable
@@ -45,7 +45,6 @@ def file_button(
         complain,
         multiple=multiple,
         label=label,
-        accept=",".join(suffixes),
         max_file_size=MAX_UPLOAD_BYTES,
         variant="outlined",
         size="small",

@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 
 from app.model.store import Answer, Source
 from app.model.text import cause
-from app.model.truth import SUFFIXES, Truth, check_truth, offered_truths
+from app.model.truth import Truth, check_truth, offered_truths
 from app.model.uploads import Uploads
 from app.pages.session import Session
 from app.widgets.cards import button, part, select
@@ -66,7 +66,7 @@ class TruthForm:
         self._source: Source | None = None
         self._jobs = session.tasks.latest()
         self.status = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
-        self.file = file_button(TRUTH_OPTIONS["truth"], SUFFIXES, self._upload, self._refuse)
+        self.file = file_button(TRUTH_OPTIONS["truth"], self._upload, self._refuse)
         units = {"as the file states": ""} | {UNITS[unit]: unit for unit in TRUTH_UNITS}
         label, help = TRUTH_OPTIONS["truth_unit"], "Unit of the numbers in the file."
         self.unit = select(label, units, "", help)
