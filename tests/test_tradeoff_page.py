@@ -15,11 +15,12 @@ from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources, scene_source
 from app.pages.layout import CUSTOM, Layout
 from app.pages.session import Session
+from app.pages.shared.downloads import looked_at
 from app.pages.shared.outputs import table_of
 from app.pages.shared.section import Repetitions
 from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import ablation_text, text
-from app.pages.tradeoff.ablation import AblationSection
+from app.pages.tradeoff.ablation import AblationSection, Verdicts
 from app.pages.tradeoff.acquisition import AcquisitionSection
 from app.pages.tradeoff.sensitivity import SensitivitySection
 from app.pages.tradeoff.speed import Effort, SpeedSection, show_point, source_of
@@ -315,10 +316,23 @@ def test_verdicts_are_those_of_the_scene_with_its_flux(ablation, session):
         assert rows[each.part]["cells"][0][0] == each.verdict
         assert each.why in rows[each.part]["note"]
         assert len(rows[each.part]["cells"]) == len(ablation_text.COLUMNS) - 1
-    change(session, light=Illumination(sbr=0.5))
-    assert all("message" in row for row in ablation.table.rows)
-    ablation.draw(verdicts)  # of the scene before: it ends late
-    assert all("message" in row for row in ablation.table.rows)
+    assert "has changed" not in ablation.subject.text
+
+
+def test_verdicts_of_another_scene_or_flux_are_outdated(ablation, session):
+    before = session.answer.request
+    seen = Requirement("pile_up", "needed", "why", effect=0.5, smallest_effect=0.1, p_value=1e-3)
+    verdicts = Verdicts(before, 2, (seen,))
+    ablation.draw(verdicts)
+    for changed in ({"light": Illumination(sbr=0.5)}, {"source": "worn"}):
+        change(session, **changed)
+        ablation.draw(verdicts)  # of the scene before: it ends late
+        assert rows_of(ablation)["pile_up"]["cells"][0][0] == "needed"
+        assert ablation.subject.text == f"Few pixels, 2 repetitions. {text.OUTDATED}"
+        assert ablation.about().source == looked_at(session, before).source
+    assert rows_of(ablation)["jitter"]["message"] == "Not studied yet."
+    change(session, source=session.key(before.source), light=before.light)
+    assert ablation.subject.text == "Few pixels, 2 repetitions."
 
 
 def test_a_row_of_a_capture_shows_the_effect_and_the_smallest_that_is_seen():

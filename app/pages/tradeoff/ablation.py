@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from app.model.store import Answer, Request, same_subject
+from app.model.store import Request, same_subject
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.section import Repetitions, SettingsSection
@@ -74,13 +74,12 @@ class AblationSection(SettingsSection[Repetitions]):
 
     def about(self) -> Subject:
         """Return what the section's files are about."""
-        return looked_at(self.session, self._studied)
+        return looked_at(self.session, self._subject)
 
-    def follow(self, answer: Answer) -> None:
-        """Show another estimate: verdicts hold for one scene with one flux."""
-        if not same_subject(answer.request, self._studied):
-            self._found, self._studied = {}, answer.request
-        self.refresh()
+    @property
+    def _subject(self) -> Request:
+        """What the verdicts hold for: one scene with one flux, or a capture."""
+        return self._studied if self._found else self.session.answer.request
 
     def _switch(self, name: str) -> None:
         state = self.session.state
@@ -104,21 +103,20 @@ class AblationSection(SettingsSection[Repetitions]):
         return work
 
     def draw(self, verdicts: Verdicts) -> None:
-        """Show verdicts, unless another scene or capture has been chosen since."""
-        if same_subject(self.session.answer.request, verdicts.request):
-            self._studied, self._repetitions = verdicts.request, verdicts.repetitions
-            self._found = {each.part: each for each in verdicts.found}
+        """Show verdicts; the page says if another scene or capture has been chosen since."""
+        self._studied, self._repetitions = verdicts.request, verdicts.repetitions
+        self._found = {each.part: each for each in verdicts.found}
         self.refresh()
 
     def refresh(self) -> None:
         """Write the table."""
-        request = self.session.answer.request
-        absent = self.session.state.absent
+        request, subject = self.session.answer.request, self._subject
+        absent, is_present = self.session.state.absent, same_subject(request, subject)
         parts = parts_of(request.whole_scene) if request.source.is_scene else ()
         can_switch = (*CORRECTIONS, *parts)
         with self.session.tasks.hold():
             self.subject.text = text.subject(
-                request.source.title, self._repetitions if self._found else 0, absent
+                subject.source.title, self._repetitions, absent, is_present
             )
             self.table.rows = [
                 text.row(name, self._found.get(name), name in can_switch, name in absent)

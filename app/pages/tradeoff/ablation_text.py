@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection
 
 from app.model.text import Cell, cell, interval_cell, percent_cell
+from app.pages.tradeoff.text import OUTDATED
 from core.studies.ablation import COMPARISON_NOTE, KINDS_NOTE, TITLES, Requirement
 
 __all__ = ["COLUMNS", "EXPLANATION", "NOTE", "TITLE", "row", "subject"]
@@ -47,11 +48,16 @@ COLUMNS = (
 )
 
 
-def subject(title: str, repetitions: int, absent: Collection[str]) -> str:
-    """Return what is studied, how often if it was simulated, and what is switched off."""
+def subject(title: str, repetitions: int, absent: Collection[str], is_present: bool) -> str:
+    """Return what is studied, how often if it was simulated, and what is switched off.
+
+    Unless it is present, the sentence says how to study the scene or capture on screen.
+    """
     names = ", ".join(TITLES[name] for name in TITLES if name in absent)
     often = f", {repetitions} repetitions" if repetitions else ""
-    return f"{title}{often}." + (f" Switched off on all pages: {names}." if names else "")
+    switched = f"Switched off on all pages: {names}." if names else ""
+    outdated = "" if is_present else OUTDATED
+    return " ".join(filter(None, (f"{title}{often}.", outdated, switched)))
 
 
 def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) -> dict[str, object]:

@@ -44,6 +44,8 @@ FLUX_HELP = (
     "after a change of a setting."
 )
 
+OUTDATED = "The capture has changed since: press Compute to repeat it."
+
 COLUMNS = (
     ("Configuration", "Method, and how much of the capture it uses.", 1),
     ("Within 3 bins", "Share of the target pixels, with its 95 % interval.", -1),
@@ -116,7 +118,7 @@ def subject(point: Point, repetitions: int, rounds: int, is_present: bool) -> st
     sbr = "" if point.sbr is None else f", SBR {point.sbr:.3g}"
     pulses = "" if point.n_pulses is None else f", {point.n_pulses:,} pulses"
     note = f" ({point.note})" if point.note else ""
-    outdated = "" if is_present else " The capture has changed since: press Compute to repeat it."
+    outdated = "" if is_present else f" {OUTDATED}"
     often = f"{repetitions} repetitions, {rounds} timing rounds"
     return f"{point.source}{note}, {rows} × {cols} × {bins}{sbr}{pulses}; {often}.{outdated}"
 
