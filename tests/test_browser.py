@@ -938,6 +938,8 @@ def saved_arrays(**arrays: np.ndarray | str) -> bytes:
 
 def refuse_files_and_show_names_as_text(one: Page, folder: Path, troubles: list[str]) -> None:
     """Upload files to a page that shows the car."""
+    upload(one, "notes.txt", b"nothing of the kind")
+    expect(warning(one)).to_contain_text("notes.txt: suffix = '.txt' is not accepted")
     upload(one, "holiday.npz", b"nothing of the kind")
     expect(warning(one)).to_contain_text("holiday.npz")
     expect(warning(one)).to_contain_text("copy or save it again")
