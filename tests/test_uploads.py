@@ -96,6 +96,16 @@ def test_a_file_is_read_or_refused_by_its_content_whatever_its_name(content):
     assert layout.alert.text == ""
 
 
+def test_an_estimate_that_arrives_after_an_upload_does_not_open_inspect():
+    layout = HeldLayout(built_in_sources(), uploads=Uploads())
+    control(layout, "Scene or capture").value = "wall"
+    button = control(layout, "Open a capture file")
+    button.param.update(filename=["notes.txt"], value=[b"nothing of the kind"])
+    layout.tasks.run_until(lambda: layout.session.estimate.refused)
+    assert layout.session.answer.request.source.title == "Oblique wall"
+    assert layout.session.state.page == "Explore"
+
+
 def test_the_question_about_an_upload_is_asked_again_after_a_reload(tmp_path):
     cube = np.ones((4, 6, 37), np.uint8)
     np.savez(tmp_path / "two.npz", spad=cube, rates=cube / 7)

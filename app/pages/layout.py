@@ -495,7 +495,7 @@ class Layout:
     def _fit_controls(self, answer: Answer) -> None:
         """Show an estimate in all but the pages, which show that of the session when they open."""
         state = self.session.state
-        if state.source == self._uploaded:  # it could be read
+        if answer.request.source is self.session.sources.get(self._uploaded):  # it could be read
             self._uploaded, state.page = "", "Inspect"
         if self._source.value != state.source:
             self._source.value = state.source
