@@ -10,7 +10,8 @@ maximisation: neighbours share them, and a single pixel of few photons does not 
 pixels have a second surface, how strong it is and how alike neighbours are in that is learned from
 the evidence of the pixels by themselves: a net has holes. Layers closer than `_LEAST_DISTANCE_BINS`
 are one. A second surface is accepted if it is likelier than all but a given share of those in an
-image that is drawn with the first layer alone.
+image that is drawn with the first layer alone, and if the pixel by itself, with the share of the
+pixels around that have one, rather sees it than not.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ _LEVELS = np.array([[0.25, 0.5, 0.75, 1.0], [0.15, 0.3, 0.5, 0.7]])
 
 _FIRST_SHARES = np.array([0.7, 0.3])  # of the layers in the signal, before it is fitted
 _LEAST_DISTANCE_BINS = 2.0
+_PRESENCE_STEPS = 20  # of expectation and maximisation
 _LIKELY = 0.5  # probability from which a pixel has a second surface
 _ALIKE = np.full(_LEVELS.shape[1], 1 / _LEVELS.shape[1])  # shares of levels
 _SAMPLE = 1024  # pixels from which shares of levels are learned
@@ -140,9 +142,30 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
         least = solved(_states(log, prior), prior, agreement).nothing
         most = min(_LIKELY, float(np.quantile(least[present[0]], false_return)))
         present[1] &= (second.nothing < most) & _apart(delay)
-    confidence = np.stack([_mass(first, delay[0]), _mass(second.surface, delay[1])])
+    seen = _presence(_log_ratios(image, fluxes, 1, delay[0], only, _ALIKE), delay[1])
+    present[1] &= seen > _LIKELY
+    confidence = np.stack(
+        [_mass(first, delay[0]), np.minimum(_mass(second.surface, delay[1]), seen)]
+    )
     delay[1, ~present[1]] = np.nan
     return Layers(delay * factor, fluxes.signal.reshape(2, *shape), confidence)
+
+
+def _presence(log: NDArray[np.float32], delay: Floats) -> Floats:
+    """Return the probability that each pixel has a surface where its neighbours do, (row, col).
+
+    They tell where it is. How many around have one is learned from the evidence of each pixel by
+    itself, log likelihood ratios (row, col, bin), since neighbours may well differ in that, as in
+    foliage.
+    """
+    away = np.abs(np.arange(log.shape[2]) + 0.5 - delay[..., np.newaxis]) > _LEAST_DISTANCE_BINS
+    evidence = np.where(away, -np.inf, log).max(axis=2).astype(float)
+    share = presence = np.full(delay.shape, 0.5)
+    for _ in range(_PRESENCE_STEPS):
+        presence = np.asarray(scipy.special.expit(evidence + scipy.special.logit(share)))
+        around = scipy.ndimage.uniform_filter(presence, _WINDOW)
+        share = np.clip(around, _LEAST_SHARE, 1 - _LEAST_SHARE)
+    return presence
 
 
 def _apart(delay: Floats) -> NDArray[np.bool_]:

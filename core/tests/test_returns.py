@@ -271,6 +271,31 @@ def test_few_holes_of_a_net_get_a_second_surface() -> None:
 
 
 @compiled
+@pytest.mark.parametrize(("signal", "n_pulses", "most_false"), [(0.5, 50, 0.3), (0.2, 1000, 0.05)])
+def test_gaps_in_foliage_get_few_second_surfaces(
+    signal: float, n_pulses: int, most_false: float
+) -> None:
+    """Half of the pixels, at random, have a second surface behind the first."""
+    col = np.mgrid[:32, :32][1]
+    has_behind = np.random.default_rng(0).random(col.shape) < 0.5
+    acquisition = Acquisition(n_pulses=n_pulses)
+    front, behind = (
+        rate_per_bin(onset + 0.1 * col, np.full(col.shape, signal), 0.0, Pulse(), acquisition)
+        for onset in (30.4, 50.4)
+    )
+    rate = front + np.where(has_behind[..., np.newaxis], behind, 0.0) + 1 / acquisition.n_bins
+    counts = draw_counts(rate, n_pulses, np.random.default_rng(1))
+    image = core.estimate(core.Capture(counts, acquisition), "image_posterior", returns=2)
+    has_two = image.returns.count(col.shape) > 1
+    assert has_two[~has_behind].mean() < most_false
+    assert has_two[has_behind].mean() > 0.9
+    second = image.returns.number == 2
+    is_true = has_behind[image.returns.row, image.returns.col][second]
+    sure = image.returns.confidence[second] >= 0.9
+    assert is_true[sure].mean() > 0.9
+
+
+@compiled
 def test_three_surfaces_are_found() -> None:
     delay = np.array([12.0, 30.0, 50.0]) + np.random.default_rng(0).uniform(0, 40, (64, 1))
     echoes = Pulse().bin_probability(delay, 100, 1e-9)
