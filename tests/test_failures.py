@@ -388,6 +388,20 @@ def test_a_refused_reading_option_is_reported_and_the_next_reading_works():
     assert layout.session.answer.capture.acquisition.bin_width_s == 2e-9
 
 
+def test_a_value_that_arrives_after_its_answer_does_not_replace_what_is_in_use():
+    """Enter arrives before the value that it completes, and a small file is read before that."""
+    layout = HeldLayout({"sample": built_in_sources()["sample"]})
+    opened(layout, "Reading options")
+    width = control(layout, "Bin width")
+    width.value_input = "2000 ps"
+    control(layout, "Read again").clicks += 1
+    layout.tasks.run_until(lambda: width.value == "2 ns")
+    width.value = "2000 ps"
+    assert width.value == "2 ns"
+    width.value = "3000 ps"
+    assert width.value == "3000 ps"
+
+
 def test_the_form_stays_open_for_a_file_that_is_refused(tmp_path):
     np.savez(
         tmp_path / "two.npz", day=np.ones((4, 5, 30), int), night=np.eye(30)[:20].reshape(4, 5, 30)

@@ -60,6 +60,7 @@ class ReadingForm:
     ) -> None:
         self._read, self._complain = read, complain
         self._reading, self._shown = ReadOptions(), dict.fromkeys(reading_options(), "")
+        self._applied: dict[str, str] = {}
         self._about = Sentence(sizing_mode="stretch_width", margin=(4, 8), visible=False)
         self._fields: dict[str, Any] = {}
         self.part = part("Reading options", is_open=False, is_shown=False)
@@ -98,9 +99,10 @@ class ReadingForm:
 
     def _form(self) -> list[Any]:
         self._fields = {name: _field(name, shown) for name, shown in self._shown.items()}
-        for field in self._fields.values():
+        for name, field in self._fields.items():
             if isinstance(field, pmui.TextInput):
                 field.param.watch(lambda _: self._apply(), "enter_pressed")
+                field.param.watch(partial(self._show_again, name), "value")
         again = pmui.Button(label="Read again", size="small", margin=(6, 8))
         again.on_click(lambda _: self._apply())
         return [self._about, *self._fields.values(), again]
@@ -153,11 +155,21 @@ class ReadingForm:
         if (reading, shown) == (self._reading, self._shown):
             return
         self._reading, self._shown = reading, shown
+        self._applied = {name: typed(field) for name, field in self._fields.items()}
         for name, field in self._fields.items():
             field.value = shown[name]
 
+    def _show_again(self, name: str, event: Any) -> None:
+        """Show the option in use again, where what was typed for it arrives after the answer.
+
+        Enter arrives before the value that it completes, and a small file is read before that.
+        """
+        if event.new == self._applied.get(name) and event.new != self._shown[name]:
+            self._fields[name].value = self._shown[name]
+
     def _apply(self, chosen: Mapping[str, str] | None = None) -> None:
         typed_in = {name: typed(field) for name, field in self._fields.items()}
+        self._applied = {}
         texts = self._shown | typed_in | dict(chosen or {})
         try:
             self._read(changed_options(self._reading, self._shown, texts))
