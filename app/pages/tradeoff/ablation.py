@@ -78,7 +78,7 @@ class AblationSection(SettingsSection[Repetitions]):
 
     @property
     def _subject(self) -> Request:
-        """What the verdicts hold for: one scene with one flux, or a capture."""
+        """Scene with its flux, or capture, for which the verdicts hold."""
         return self._studied if self._found else self.session.answer.request
 
     def _switch(self, name: str) -> None:
