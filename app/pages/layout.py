@@ -61,12 +61,19 @@ MORE_TRACKING = "More tracking settings"
 COMMON = ("l", "n", "alpha", "t_n")
 """Settings of the tracking differentiator that are not folded; the others are rarely changed."""
 
+# The help of a button covers its right neighbour: it lets clicks through, and closes when the
+# pointer moves on. By default it would be as narrow as its button.
+TOOLTIP = {
+    "defaultProps": {"disableInteractive": True},
+    "styleOverrides": {"tooltip": {"width": "max-content", "maxWidth": "230px"}},
+}
 THEME = {
     mode: {
         "palette": {"primary": {"main": main}, "background": {"default": page, "paper": paper}},
         "typography": {"fontSize": 13},
         "components": {
             "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": bar, "color": "#ffffff"}}},
+            "MuiTooltip": TOOLTIP,
             "MuiToolbar": {
                 "styleOverrides": {
                     "root": {

@@ -17,8 +17,6 @@ HELP = (
 )
 # Below the title, beside the label of the upper axis.
 PLACE = {"position": "absolute", "top": "12px", "right": "26px", "z-index": "3"}
-# Else as narrow as the button, since that is positioned.
-TOOLTIP = ".MuiTooltip-tooltip { width: 230px; max-width: 230px; }"
 SMALL = {"fontSize": "11px", "padding": "0 6px", "minHeight": "18px", "lineHeight": "18px"}
 
 
@@ -43,7 +41,6 @@ class EchoZoom:
             variant="text",
             min_height=18,
             styles=PLACE,
-            stylesheets=[TOOLTIP],
             sx=SMALL,
             disabled=True,
         )
