@@ -221,6 +221,7 @@ def upload(page: Page, name: str, content: bytes) -> None:
     page.locator("input[type=file]").set_input_files(file)
     # The button is replaced when it first shows a name: a file set on the old one would be lost.
     expect(page.get_by_role("button", name=name, exact=True)).to_be_visible()
+    expect(page.get_by_text("Open a capture file")).to_be_visible()
 
 
 def pixels(png: bytes) -> np.ndarray:

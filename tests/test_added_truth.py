@@ -14,7 +14,7 @@ import pytest
 import core
 from app.model.script import script_of
 from app.model.store import file_source
-from app.model.uploads import Uploads
+from app.model.uploads import Bounds, Uploads
 from app.pages.shared.truth import UNITS
 from app.widgets.cards import Part
 from tests.states import link_to
@@ -30,7 +30,8 @@ def known():
 
 @pytest.fixture
 def uploads():
-    return Uploads()
+    """Room for one file: a truth that does not fit makes room for the next."""
+    return Uploads(Bounds(session_files=1))
 
 
 @pytest.fixture

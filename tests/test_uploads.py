@@ -96,6 +96,27 @@ def test_a_file_is_read_or_refused_by_its_content_whatever_its_name(content):
     assert layout.alert.text == ""
 
 
+def test_files_that_could_not_be_read_make_room_for_the_next(folder, content):
+    layout = HeldLayout(built_in_sources(), uploads=Uploads(Bounds(session_files=2)))
+    session, button = layout.session, control(layout, "Open a capture file")
+    button.param.update(filename=["first.npz"], value=[content])
+    layout.next_answer()
+    link = ""
+    for name in ("notes.txt", "more.txt"):
+        button.param.update(filename=[name], value=[b"nothing of the kind"])
+        layout.tasks.run_until(lambda name=name: name in layout.alert.text)
+        link = link or session.query()
+    assert stored(folder) == ["first.npz", "more.txt"]
+    session.recall(link)  # as by Undo
+    layout.settle()
+    assert session.estimate.refused is None
+    button.param.update(filename=["last.npz"], value=[content])
+    assert layout.next_answer().request.source.title == "last.npz"
+    assert stored(folder) == ["first.npz", "last.npz"]
+    offered = control(layout, "Scene or capture").options
+    assert {"first.npz", "last.npz"} <= {*offered} and not {"notes.txt", "more.txt"} & {*offered}
+
+
 def test_an_estimate_that_arrives_after_an_upload_does_not_open_inspect():
     layout = HeldLayout(built_in_sources(), uploads=Uploads())
     control(layout, "Scene or capture").value = "wall"

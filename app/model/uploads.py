@@ -127,6 +127,15 @@ class Uploads:
                 upload.users.add(user)
             return upload
 
+    def release(self, key: str, user: object) -> bool:
+        """Remove a user from a file; return whether there is such a file."""
+        with self._lock:
+            upload = self._uploads.get(key)
+            if upload is not None:
+                upload.users.discard(user)
+                self._delete_unused()
+            return upload is not None
+
     def leave(self, user: object) -> None:
         """Remove a user, and the files that no other user has."""
         with self._lock:

@@ -274,6 +274,7 @@ class Layout:
         self.pages.choice.param.update(sx=PAGE_BUTTONS, margin=(0, 0, 0, 8))
         self.page = self._template()
         self._subject: tuple[object, ...] = ()
+        self._unreadable: set[str] = set()
         self._fit_controls(session.answer)
         self._listen()
         if arrivals is not None:
@@ -502,6 +503,7 @@ class Layout:
     def _fit_controls(self, answer: Answer) -> None:
         """Show an estimate in all but the pages, which show that of the session when they open."""
         state = self.session.state
+        self._note_unreadable(answer)
         if answer.request.source is self.session.sources.get(self._uploaded):  # it could be read
             self._uploaded, state.page = "", "Inspect"
         if self._source.value != state.source:
@@ -516,6 +518,13 @@ class Layout:
         self._budget.refresh()
         self._describe_print()
         self._show_settings()
+
+    def _note_unreadable(self, answer: Answer) -> None:
+        """Keep which file could not be read, until one of its readings succeeds."""
+        session, refused = self.session, self.session.estimate.refused
+        if refused is not None:
+            self._unreadable.add(session.key(refused.request.source))
+        self._unreadable.discard(session.key(answer.request.source))
 
     def _fit_to(self, answer: Answer) -> None:
         """Show a capture and the kind of its estimate, which few settings change."""
@@ -601,7 +610,11 @@ class Layout:
             self.session.state.tracking = PRESETS[name]
 
     def _upload(self, files: dict[str, bytes]) -> None:
-        """Offer files as one sequence in time if their names say so, else each by itself."""
+        """Offer files as one sequence in time if their names say so, else each by itself.
+
+        Earlier ones that could not be read make room.
+        """
+        self._remove_unreadable()
         is_sequence = pattern_of(list(files)) is not None
         keys = []
         try:
@@ -611,9 +624,16 @@ class Layout:
             self.session.failures.show(text.not_kept(error))
         for key in keys:
             self.session.sources.update(self._with_uploads({}, key))
+        self._source.options = self._titles()
         if keys:
-            self._source.options = self._titles()
             self._uploaded = self._source.value = keys[0]
+
+    def _remove_unreadable(self) -> None:
+        """Remove uploads that could not be read; other files remain in the list."""
+        for key in self._unreadable:
+            if self._uploads.release(key, self):
+                self.session.forget_source(key)
+        self._unreadable.clear()
 
     def _read(self, options: ReadOptions) -> None:
         """Read the file that the form is for: the one on screen, or the one that was refused."""

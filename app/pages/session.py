@@ -186,6 +186,18 @@ class Session:
         entries |= {"source": key, "pixel": json.dumps(self.state.pixel), "unread": ""}
         self.recall(urlencode(entries))
 
+    def forget_source(self, key: str) -> None:
+        """Remove a file that could not be read."""
+        source = self.sources.pop(key)
+        self._unread = {
+            query: refused
+            for query, refused in self._unread.items()
+            if refused is None or refused.request.source is not source
+        }
+        refused = self.estimate.refused
+        if refused is not None and refused.request.source is source:
+            self.estimate.refused = None
+
     def _find_places(self) -> None:
         """Return to the recalled pixel, pins, region and views, once their estimate is there."""
         if self._recalled is not None and self.estimate.is_settled:

@@ -45,6 +45,7 @@ def file_button(
         complain,
         multiple=multiple,
         label=label,
+        uploaded_label=label,  # "Uploaded NAME" would stay where the file could not be read
         max_file_size=MAX_UPLOAD_BYTES,
         variant="outlined",
         size="small",

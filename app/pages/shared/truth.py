@@ -62,7 +62,7 @@ class TruthForm:
         self, session: Session, uploads: Uploads, user: object, add: Callable[[Truth], None]
     ) -> None:
         self._session, self._uploads, self._user, self._add = session, uploads, user, add
-        self._key = ""
+        self._key, self._is_added = "", False
         self._source: Source | None = None
         self._jobs = session.tasks.latest()
         self.status = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
@@ -99,11 +99,14 @@ class TruthForm:
             self._source, self.status.text = source, ""
 
     def _upload(self, files: dict[str, bytes]) -> None:
+        if not self._is_added:
+            self._uploads.release(self._key, self._user)
         try:
             self._key = self._uploads.add(files, self._user)
         except (ValueError, OSError) as error:
             self._refuse(cause(error))
         else:
+            self._is_added = False
             self._try()
 
     def _try(self) -> None:
@@ -117,7 +120,7 @@ class TruthForm:
 
         def accept(_: Any) -> None:
             if source is self._session.answer.request.source:  # else it was checked for another
-                self.status.text = ""
+                self.status.text, self._is_added = "", True
                 self._add(truth)
 
         def refuse(error: Exception) -> None:
