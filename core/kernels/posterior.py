@@ -13,6 +13,7 @@ from core.kernels.parallel import COMPILED, SUMMING
 
 _STEPS = 100  # of expectation and maximisation
 _DARK_PIXELS = 0.1  # additional pixels without an echo, so that their share is never 0
+_NEGLIGIBLE = np.float32(1e-30)  # density, of which products are subnormal: those are slow
 _UNIFORM_SHARE = 0.1  # initial share of the surfaces with a delay that is uniform over the gate
 
 _SMOOTHING_BINS = 1.0
@@ -88,6 +89,9 @@ def learn_shares_and_depths(density, n_steps, share, depth):  # type: ignore[no-
             weight = np.float32(share[level] / (1 - share[0]))
             for k in range(n_bins):
                 echo[pixel, k] += weight * density[pixel, level, k]
+        for k in range(n_bins):
+            if echo[pixel, k] < _NEGLIGIBLE:
+                echo[pixel, k] = 0.0
     some, uniform, before = depth.copy(), _UNIFORM_SHARE, share[0]
     dark = before
     for _ in range(n_steps):
