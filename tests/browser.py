@@ -32,6 +32,18 @@ const walk = (view) => { views.push(view); (view.child_views ?? []).forEach(walk
 """
 """JavaScript that sets ``views`` to all views of Bokeh on the page."""
 
+TITLES_FIT = f"""() => {{
+  {VIEWS}
+  const pen = document.createElement("canvas").getContext("2d");
+  const roomBeside = ({{ el, frame, model: {{ title }} }}) => {{
+    pen.font = `${{title.text_font_style}} ${{title.text_font_size}} ${{title.text_font}}`;
+    return el.clientWidth - frame.bbox.left - pen.measureText(title.text).width;
+  }};
+  const plots = views.filter(({{ el, model }}) => model.type === "Figure" && el.clientWidth);
+  return plots.every((plot) => roomBeside(plot) >= 24);
+}}"""
+"""Whether the titles of plots end before the download button in the corner."""
+
 ROOT = Path(__file__).resolve().parent.parent
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

@@ -21,7 +21,7 @@ from app.pages.shared.measure import TOO_MANY_PINS
 from app.plots.elements import READ_OUT as VALUE_READ_OUT
 from core import Capture, RangeImage, inspection
 from core.inference import predictive_of
-from tests.browser import VIEWS, choose, enter, eventually, fact, field, slider
+from tests.browser import TITLES_FIT, VIEWS, choose, enter, eventually, fact, field, slider
 from tests.browser import image as picture
 from tests.test_downloads import columns_of, download
 from tests.test_lasting import here as address_of
@@ -122,7 +122,7 @@ def place_at(page: Page, across: float, down: float) -> tuple[float, float]:
     return tuple(of_picture(page, f"[{row}, {col}]"))
 
 
-COUNTS, RATE, STAGES = "Counts, and the two scales", "Rate", "Residual, and enhanced"
+COUNTS, RATE, STAGES = "Counts, and the two scales", "Rate", "Enhanced"
 
 
 # -- actions of a user -----------------------------------------------------------------------------
@@ -468,6 +468,7 @@ def show_all_parts_below_each_other(page: Page) -> None:
             len(boxes) == n_plots + 1
             and all(0 <= box["left"] < box["right"] <= 390 for box in boxes)
             and all(box["bottom"] <= below["top"] for box, below in pairwise(boxes))
+            and page.evaluate(TITLES_FIT)
         )
 
     for subject, n_plots in (

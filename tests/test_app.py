@@ -536,6 +536,18 @@ def test_the_frame_of_a_narrow_image_is_wide_enough_to_be_read(car, rows, cols, 
     assert f"/ {proportions:g} +" in style
 
 
+@pytest.mark.parametrize(
+    ("rows", "cols", "height", "width"), [(1, 8, 1, 1), (2, 600, 1, 16.8), (64, 64, 3, 3)]
+)
+def test_the_frame_of_a_pixel_is_visible_and_close_around_large_pixels(
+    car, rows, cols, height, width
+):
+    view = ImageView(lambda row, col: None)
+    view.enter(rows, cols, car.grid)
+    left, bottom, right, top = view.frame(0, 5)
+    assert (top - bottom, right - left) == pytest.approx((height, width))
+
+
 # -- controls --------------------------------------------------------------------------------------
 
 

@@ -721,6 +721,8 @@ def save_the_visible_part_of_a_plot(here):
 def save_a_cloud_as_picture_and_points(here):
     stage = here.locator(".stage").first
     shown_points, box = int(stage.get_attribute("data-points")), stage.bounding_box()
+    caption = here.locator(".caption").first.bounding_box()
+    assert caption["y"] >= box["y"] + box["height"] - 1  # below the axes
     name, png = download(here, "3D cloud", "png")
     assert name == "car_tracking_cloud.png"
     picture = Image.open(io.BytesIO(png)).convert("RGB")

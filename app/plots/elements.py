@@ -251,9 +251,14 @@ def range_image() -> hv.Overlay:
     )
 
 
-def pixel_frame(row: float, col: float, half: float = 1.5) -> tuple[float, float, float, float]:
-    """Return left, bottom, right and top of a frame that does not cover its pixel."""
-    return col - half, row - half, col + half, row + half
+def pixel_frame(
+    row: float, col: float, down: float = 1.5, across: float = 1.5
+) -> tuple[float, float, float, float]:
+    """Return left, bottom, right and top of a frame, by default one that does not cover its pixel.
+
+    It extends as far `down` as up, and as far to the left as `across`.
+    """
+    return col - across, row - down, col + across, row + down
 
 
 def score_curves() -> hv.Overlay:

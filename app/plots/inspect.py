@@ -19,18 +19,17 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from app.plots.elements import SCORE_TITLE
+from app.plots.elements import ENHANCED_TITLE, SCORE_TITLE
 
 MARKS = "marks"
 RATE_TITLES = {
     "photons per pulse": "Rate, pile-up corrected (Coates)",
     "photons": "Rate as counted (no pile-up to correct)",
 }
-STAGES_TITLE = "Residual, and enhanced"
 COUNTS_TITLES = {True: "Counts, and the two scales that follow them", False: "Counts"}
 """Titles with and without the scales."""
 FIT_TITLE = "Counts, and those that the model expects"
-EVIDENCE_TITLE = "Probability of the surface from the pixel, its neighbours and both"
+EVIDENCE_TITLE = "Probability of the surface"
 RESIDUAL_TITLE = "Residuals: counts minus expected ones"
 FIT_COLUMNS = ("bin", "fit", "low", "high")
 CANDIDATE_HEIGHT = 0.05
@@ -114,7 +113,7 @@ def rate(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
 
 def stages(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     """Plot the residual of the two scales, and the weighted residual on an axis of its own."""
-    drawing = _over_the_gate(STAGES_TITLE, "Residual (counts)", bins)
+    drawing = _over_the_gate(ENHANCED_TITLE, "Residual (counts)", bins)
     source = empty("bin", "residual", "enhanced")
     drawing.extra_y_ranges["enhanced"] = Range1d(0, 1)
     axis = LinearAxis(y_range_name="enhanced", axis_label="Counts × weight")

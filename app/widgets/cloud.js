@@ -7,7 +7,8 @@
 
 const VIEW_ANGLE_DEG = 20
 const HALF_VIEW = Math.tan((VIEW_ANGLE_DEG * Math.PI) / 360)
-const LABEL_ROOM_PX = [75, 50] // beside and above the box in the home view, for tick labels
+const LABEL_ROOM_PX = [75, 40] // beside and above the box in the home view, for tick labels
+const LINE_PX = 17 // height of a line of the caption
 const LABEL_LETTER_PX = 6 // width of an average letter of a label
 const BOX_INK = 0.25 // share of the text colour in the lines of the box
 const CLICK_MOVE_PX = 4 // a press that moves less than this is a click, not a drag
@@ -41,17 +42,19 @@ const RING = `
 
 const STYLE = `
 .cloud { position: relative; width: 100%; height: 100%; min-height: 120px; overflow: hidden;
-  color: var(--ink); background: var(--paper); font: 12px/1.4 system-ui, sans-serif; }
-.stage { position: absolute; inset: 0; cursor: grab; touch-action: none; user-select: none;
-  -webkit-user-select: none; outline: none; }
+  display: flex; flex-direction: column; color: var(--ink); background: var(--paper);
+  font: 12px/${LINE_PX}px var(--mui-font-family, Roboto, system-ui, sans-serif); }
+.stage { position: relative; flex: 1; min-height: 0; cursor: grab; touch-action: none;
+  user-select: none; -webkit-user-select: none; outline: none; }
 .stage:active { cursor: grabbing; }
 .stage:focus-visible { outline: 2px solid #4c8dff; outline-offset: -2px; }
 .stage canvas { display: block; width: 100%; height: 100%; }
 .tick { position: absolute; left: 0; top: 0; white-space: nowrap; pointer-events: none;
-  font-size: 11px; font-variant-numeric: tabular-nums; }
-.tick, .caption { text-shadow: 0 0 3px var(--paper), 0 0 3px var(--paper); }
-.caption { position: absolute; left: 8px; bottom: 6px; right: 8px; pointer-events: none;
-  white-space: pre-line; background: color-mix(in srgb, var(--paper) 85%, transparent); }
+  font-size: 11px; font-variant-numeric: tabular-nums;
+  text-shadow: 0 0 3px var(--paper), 0 0 3px var(--paper); }
+/* Two lines from the start: the cloud keeps its size. */
+.caption { min-height: ${2 * LINE_PX}px; margin: 0 8px 6px; white-space: pre-line; }
+.caption:empty { display: none; }
 .tools { position: absolute; top: 6px; right: 6px; display: flex; gap: 2px; }
 .tools button { all: unset; box-sizing: border-box; width: 28px; height: 28px; padding: 5px;
   border-radius: 6px; cursor: pointer; opacity: 0.75; background: var(--paper); }
@@ -611,7 +614,8 @@ class CloudView {
   drawn() {
     this.draw()
     const source = this.surface.getCanvas()
-    const canvas = element("canvas", {width: source.width, height: source.height})
+    const {clientWidth: width, clientHeight: height} = this.stage.parentNode
+    const canvas = element("canvas", {width: source.width, height: Math.round(height * this.ratio)})
     const pen = canvas.getContext("2d")
     const style = getComputedStyle(this.stage.parentNode)
     pen.fillStyle = style.backgroundColor
@@ -624,10 +628,8 @@ class CloudView {
     for (const {x, y, anchor, text} of this.box.shown) {
       pen.fillText(text, x + anchor * pen.measureText(text).width, y)
     }
-    const {clientWidth: width, clientHeight: height} = this.stage
-    const lines = this.model.caption.split("\n")
-    lines.forEach((line, k) => {
-      pen.fillText(line, 8, height - 14 - 16 * (lines.length - 1 - k), width - 16)
+    this.model.caption.split("\n").forEach((line, k) => {
+      pen.fillText(line, 8, this.stage.clientHeight + LINE_PX * (k + 0.5), width - 16)
     })
     return {canvas, width, height}
   }

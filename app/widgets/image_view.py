@@ -24,6 +24,9 @@ BORDER_PX = {"left": 52, "right": 66, "top": 26, "bottom": 40}
 JOINED_BORDER_PX = {"left": 36, "right": 12, "top": 6, "bottom": 24}
 """Room around one of several images, without labels and colour bar."""
 
+LARGE_PIXELS = 20
+"""Most pixels along the longer side of a picture that are large on screen."""
+
 CONTAINER = ":host { container-type: size; }"
 """Style of the part of a page that an image fills as far as its proportions allow."""
 
@@ -103,7 +106,7 @@ class ImageView:
         """Prepare for another image, which stays blank until `update`."""
         self._shape, self._grid = (rows, cols), grid
         blank = [np.full((rows, cols), np.nan, np.float32)]
-        left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step / 2)
+        left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step / 2, grid.step / 2)
         width, height = cols * grid.step, rows * grid.step
         box = {"x": [left], "y": [above], "dw": [width], "dh": [height]}
         self._plot.source("picture").data = {"image": blank, **box}
@@ -121,10 +124,15 @@ class ImageView:
     def _keep_proportions(self) -> None:
         """Fit the frame to the image: a wider or higher one would show what is not there."""
         rows, cols = self._shape
-        own = max(cols, 1) / max(rows, 1)
-        aspect = min(max(own, 1 / MOST_ELONGATED), MOST_ELONGATED)
-        self.figure.match_aspect = aspect == own
+        aspect = self._aspect
+        self.figure.match_aspect = aspect == max(cols, 1) / max(rows, 1)
         self.figure.stylesheets = [proportioned(aspect, *around(self._border_px))]
+
+    @property
+    def _aspect(self) -> float:
+        """Width of the picture divided by its height."""
+        rows, cols = self._shape
+        return min(max(max(cols, 1) / max(rows, 1), 1 / MOST_ELONGATED), MOST_ELONGATED)
 
     def update(self, image: Array, look: ColorScale) -> None:
         """Show an image (row, col); NaN is blank."""
@@ -145,12 +153,22 @@ class ImageView:
         self.figure.title.text = look.title
 
     @property
-    def half_frame(self) -> float:
-        """Half the side of a frame in pixels of the file, large enough to be visible."""
-        return max(1.5, 0.014 * max(self._shape)) * self._grid.step
+    def half_frame(self) -> tuple[float, float]:
+        """Half the height and width of a frame in pixels of the file, large enough to be visible.
+
+        It is close around pixels that are large themselves.
+        """
+        rows, cols = self._shape
+        longest = rows * max(1.0, self._aspect), cols * max(1.0, 1 / self._aspect)
+        down, across = (0.5 if n <= LARGE_PIXELS else max(1.5, 0.014 * n) for n in longest)
+        return down * self._grid.step, across * self._grid.step
+
+    def frame(self, row: int, col: int) -> tuple[float, float, float, float]:
+        """Return left, bottom, right and top of the frame of a pixel."""
+        return plots.pixel_frame(*self._grid.place(row, col), *self.half_frame)
 
     def mark(self, row: int, col: int) -> None:
         """Frame a pixel."""
-        left, bottom, right, top = plots.pixel_frame(*self._grid.place(row, col), self.half_frame)
+        left, bottom, right, top = self.frame(row, col)
         for layer in ("shadow", "frame"):
             self._plot.write(layer, left=[left], bottom=[bottom], right=[right], top=[top])

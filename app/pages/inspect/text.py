@@ -561,8 +561,5 @@ def accuracy_titles(capture: Capture) -> tuple[str, str, str]:
     across = "Share of the pulses" if capture.acquisition.n_pulses is None else "Pulses"
     if capture.truth_range_m is not None:
         return "Accuracy against number of pulses", across, "Within 3 bins of the truth"
-    title = (
-        "Agreement with the same method and all pulses, in pixels of which it is confident by "
-        f"{CONFIDENT:g} (not accuracy)"
-    )
-    return title, across, "Within 3 bins of it"
+    within = f"Within 3 bins, confidence {CONFIDENT:g} or more"
+    return "Agreement with all pulses, not accuracy", across, within

@@ -160,7 +160,7 @@ class Navigator(ImageView):
         """Return the pixels, once each, at the vertices of a path (vertex, row and col)."""
         first, last = (0, 0), tuple(size - 1 for size in self._shape)
         inside = np.clip(path, *(np.array(self._grid.place(*at)) for at in (first, last)))
-        pixels = [self._grid.pixel(*inside[at]) for at in vertices(inside, self.half_frame)]
+        pixels = [self._grid.pixel(*inside[at]) for at in vertices(inside, max(self.half_frame))]
         return tuple(dict.fromkeys(pixels))
 
     def mark_faulty(self, faulty: Sequence[FaultyPixel]) -> None:
@@ -182,9 +182,7 @@ class Navigator(ImageView):
 
     def pin(self, pins: Sequence[tuple[int, int]], colors: Sequence[str]) -> None:
         """Frame pixels, each in its colour."""
-        frames = np.array(
-            [plots.pixel_frame(*self._grid.place(*pin), self.half_frame) for pin in pins], float
-        ).reshape(-1, 4)
+        frames = np.array([self.frame(*pin) for pin in pins], float).reshape(-1, 4)
         sides = dict(zip(("left", "bottom", "right", "top"), frames.T, strict=True))
         self._pins.data = {**sides, "color": list(colors[: len(pins)])}
 
@@ -473,7 +471,7 @@ class PixelPlots:
     def _draw_stages(self, found: Inspected, marks: list[Curve], along: Scale) -> None:
         signals = found.pixel.signals
         assert signals is not None
-        title = plots.score_title(inspect_plots.STAGES_TITLE, found.pixel, along)
+        title = plots.score_title(plots.ENHANCED_TITLE, found.pixel, along)
         self.stages.figure.title.text = title
         residual = _curves("counts", residual=signals.residual)
         enhanced = _curves("counts × weight", enhanced=signals.enhanced)
