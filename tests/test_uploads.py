@@ -117,6 +117,23 @@ def test_files_that_could_not_be_read_make_room_for_the_next(folder, content):
     assert {"first.npz", "last.npz"} <= {*offered} and not {"notes.txt", "more.txt"} & {*offered}
 
 
+def test_a_file_that_could_be_read_is_kept_when_other_options_are_refused(folder, content):
+    layout = HeldLayout(built_in_sources(), uploads=Uploads(Bounds(session_files=2)))
+    session, button = layout.session, control(layout, "Open a capture file")
+    button.param.update(filename=["first.npz"], value=[content])
+    layout.next_answer()
+    key = session.state.source
+    session.go_on_with("wall")
+    layout.settle()
+    session.recall(f"source={key}&reading.variable=none")
+    layout.tasks.run_until(lambda: session.estimate.refused is not None)
+    button.param.update(filename=["last.npz"], value=[content])
+    assert layout.next_answer().request.source.title == "last.npz"
+    assert stored(folder) == ["first.npz", "last.npz"]
+    session.go_on_with(key)
+    assert layout.next_answer().request.source.title == "first.npz"
+
+
 def test_an_estimate_that_arrives_after_an_upload_does_not_open_inspect():
     layout = HeldLayout(built_in_sources(), uploads=Uploads())
     control(layout, "Scene or capture").value = "wall"

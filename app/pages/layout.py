@@ -274,6 +274,7 @@ class Layout:
         self.pages.choice.param.update(sx=PAGE_BUTTONS, margin=(0, 0, 0, 8))
         self.page = self._template()
         self._subject: tuple[object, ...] = ()
+        self._readable: set[str] = set()
         self._unreadable: set[str] = set()
         self._fit_controls(session.answer)
         self._listen()
@@ -503,7 +504,7 @@ class Layout:
     def _fit_controls(self, answer: Answer) -> None:
         """Show an estimate in all but the pages, which show that of the session when they open."""
         state = self.session.state
-        self._note_unreadable(answer)
+        self._note_readable(answer)
         if answer.request.source is self.session.sources.get(self._uploaded):  # it could be read
             self._uploaded, state.page = "", "Inspect"
         if self._source.value != state.source:
@@ -519,12 +520,12 @@ class Layout:
         self._describe_print()
         self._show_settings()
 
-    def _note_unreadable(self, answer: Answer) -> None:
-        """Keep which file could not be read, until one of its readings succeeds."""
+    def _note_readable(self, answer: Answer) -> None:
+        """Keep which files could be read, and which could not, perhaps with other options."""
         session, refused = self.session, self.session.estimate.refused
+        self._readable.add(session.key(answer.request.source))
         if refused is not None:
             self._unreadable.add(session.key(refused.request.source))
-        self._unreadable.discard(session.key(answer.request.source))
 
     def _fit_to(self, answer: Answer) -> None:
         """Show a capture and the kind of its estimate, which few settings change."""
@@ -629,8 +630,8 @@ class Layout:
             self._uploaded = self._source.value = keys[0]
 
     def _remove_unreadable(self) -> None:
-        """Remove uploads that could not be read; other files remain in the list."""
-        for key in self._unreadable:
+        """Remove uploads that could never be read; other files remain in the list."""
+        for key in self._unreadable - self._readable:
             if self._uploads.release(key, self):
                 self.session.forget_source(key)
         self._unreadable.clear()
