@@ -40,7 +40,7 @@ from core.kernels.parallel import on_threads
 from core.kernels.returns import EchoModel, fill_further, fill_photons
 from core.trigger import draw_counts
 
-_ROUNDS = 2
+_ROUNDS = 3  # after two, a plain wall at a low SBR may keep a second layer
 _FLUX_STEPS = 3  # of expectation and maximisation, in each round
 _WINDOW = 9  # rows and columns whose pixels share their fluxes
 _LEVELS = np.array([[0.25, 0.5, 0.75, 1.0], [0.15, 0.3, 0.5, 0.7]])
