@@ -235,6 +235,26 @@ def test_any_method_is_shown_on_explore(measured):
     assert control(layout, "Guard").value == 9
 
 
+def test_a_failed_measurement_says_so_and_starts_on_another_capture(session, monkeypatch):
+    def fail(*_, **__):
+        raise ValueError("Not today.")
+
+    with monkeypatch.context() as failing:
+        failing.setattr("app.pages.tradeoff.speed.study", fail)
+        section = SpeedSection(session)
+        session.estimate.changed.subscribe(section.follow)
+        section.show(True)
+        assert section.subject.text == text.NOT_MEASURED
+        session.tasks.run_until(lambda: section.study.has_failed)
+        assert section.subject.text == text.FAILED
+        change(session, method="peak")  # on the same capture
+        assert section.subject.text == text.FAILED
+    change(session, source="wall")
+    assert section.subject.text == text.NOT_MEASURED
+    session.tasks.run_until(lambda: "images" in section.study.sentence.text)
+    section.study.cancel()
+
+
 # -- acquisition -----------------------------------------------------------------------------------
 
 

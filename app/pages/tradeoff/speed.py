@@ -112,15 +112,15 @@ class SpeedSection(SettingsSection[Effort]):
     def __init__(self, session: Session) -> None:
         super().__init__(session, Effort(), text.EXPLANATION)
         self.measured: list[Point] = []
-        self._measured_on, self._effort = session.answer.request, self.settings
+        self._measured_on = self._tried = session.answer.request
+        self._effort = self.settings
         self._colors = LIGHT
         self._goal = Goal()
         self.goal = SettingsPanel(self._goal, self._goal_changed)
-        self.study = OnePiece(session, self.work, self.draw, "images")
+        self.study = OnePiece(session, self.work, self.draw, "images", failed=self._describe)
         self.subject, *self.advice = (
             Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8)) for _ in range(3)
         )
-        self.subject.text = text.NOT_MEASURED
         # Beside the sidebar, which is closed on a phone.
         self._progress = Sentence(sizing_mode="stretch_width", margin=(4, 8))
         self.study.sentence.link(self._progress, text="text")
@@ -149,7 +149,7 @@ class SpeedSection(SettingsSection[Effort]):
     def show(self, is_on_screen: bool) -> None:
         """Come on screen, or leave it."""
         super().show(is_on_screen)
-        self.study.show(is_on_screen)
+        self._start_first()
 
     def about(self) -> Subject:
         """Return what the section's files are about."""
@@ -161,11 +161,23 @@ class SpeedSection(SettingsSection[Effort]):
         return self.saved("speed and accuracy", table_file(points_table(self.measured)))
 
     def follow(self, answer: Answer) -> None:
-        """Show whether the points are still those of the present capture."""
+        """Show another estimate; a first measurement that failed starts on another capture."""
+        self._start_first()
+
+    def _start_first(self) -> None:
+        if not same_capture(self.session.answer.request, self._tried):
+            self.study.retry()
+        self._describe()
+        self.study.show(self.is_on_screen)
+
+    def _describe(self) -> None:
+        """State what was measured and whether it is outdated, or what happens before that."""
         if self.measured:
-            is_present = same_capture(answer.request, self._measured_on)
+            is_present = same_capture(self.session.answer.request, self._measured_on)
             effort = self._effort.repetitions, self._effort.repeats
             self.subject.text = text.subject(self.measured[0], *effort, is_present)
+        else:
+            self.subject.text = text.FAILED if self.study.has_failed else text.NOT_MEASURED
 
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""
@@ -191,6 +203,8 @@ class SpeedSection(SettingsSection[Effort]):
     def work(self) -> Work[tuple[Request, Effort, list[Point]]]:
         """Return the measurement of the present scene or capture."""
         answer, effort = self.session.answer, self.settings
+        self._tried = answer.request
+        self._describe()
         source = source_of(answer)
         merges = (1, 2, 4) if effort.merges == ANY_MERGE else (1,)
         chosen = candidates(methods(answer), merges)
@@ -210,7 +224,7 @@ class SpeedSection(SettingsSection[Effort]):
         """Show measured points, with the request and the effort that they belong to."""
         self._measured_on, self._effort, self.measured = found
         self._results.visible, self._progress.visible = True, False
-        self.follow(self.session.answer)
+        self._describe()
         self._redraw()
 
     def _redraw(self) -> None:
