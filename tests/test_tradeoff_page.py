@@ -263,6 +263,12 @@ def test_a_simulation_like_a_file_is_acquired_in_other_ways(session):
     section = AcquisitionSection(session)
     section.draw(section.work()(ignored))
     assert "the capture has no truth" in section.subject.text
+    change(session, method="peak")
+    section.follow(session.answer)
+    assert text.OUTDATED not in section.subject.text
+    change(session, source="small")
+    section.follow(session.answer)
+    assert section.subject.text.endswith(text.OUTDATED)
     for each in section.cards:
         drawn = {renderer.name for renderer in each.figure.renderers}
         assert {"theory, flux known", "likelihood, simulated band"} <= drawn
@@ -348,11 +354,12 @@ def test_verdicts_of_another_scene_or_flux_are_outdated(ablation, session):
         change(session, **changed)
         ablation.draw(verdicts)  # of the scene before: it ends late
         assert rows_of(ablation)["pile_up"]["cells"][0][0] == "needed"
-        assert ablation.subject.text == f"Few pixels, 2 repetitions. {text.OUTDATED}"
+        of_before = f"Few pixels, SBR 0.06, 2 repetitions. {text.OUTDATED}"
+        assert ablation.subject.text == of_before
         assert ablation.about().source == looked_at(session, before).source
     assert rows_of(ablation)["jitter"]["message"] == "Not studied yet."
     change(session, source=session.key(before.source), light=before.light)
-    assert ablation.subject.text == "Few pixels, 2 repetitions."
+    assert ablation.subject.text == "Few pixels, SBR 0.06, 2 repetitions."
 
 
 def test_a_row_of_a_capture_shows_the_effect_and_the_smallest_that_is_seen():

@@ -113,10 +113,11 @@ class AblationSection(SettingsSection[Repetitions]):
         request, subject = self.session.answer.request, self._subject
         absent, is_present = self.session.state.absent, same_subject(request, subject)
         parts = parts_of(request.whole_scene) if request.source.is_scene else ()
+        sbr = subject.illumination.sbr if subject.source.is_scene else None
         can_switch = (*CORRECTIONS, *parts)
         with self.session.tasks.hold():
             self.subject.text = text.subject(
-                subject.source.title, self._repetitions, absent, is_present
+                subject.source.title, sbr, self._repetitions, absent, is_present
             )
             self.table.rows = [
                 text.row(name, self._found.get(name), name in can_switch, name in absent)

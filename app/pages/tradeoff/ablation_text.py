@@ -48,16 +48,20 @@ COLUMNS = (
 )
 
 
-def subject(title: str, repetitions: int, absent: Collection[str], is_present: bool) -> str:
+def subject(
+    title: str, sbr: float | None, repetitions: int, absent: Collection[str], is_present: bool
+) -> str:
     """Return what is studied, how often if it was simulated, and what is switched off.
 
-    Unless it is present, the sentence says how to study the scene or capture on screen.
+    The SBR is that of a scene. Unless it is present, the sentence says how to study the scene or
+    capture on screen.
     """
     names = ", ".join(TITLES[name] for name in TITLES if name in absent)
+    light = "" if sbr is None else f", SBR {sbr:.3g}"
     often = f", {repetitions} repetitions" if repetitions else ""
     switched = f"Switched off on all pages: {names}." if names else ""
     outdated = "" if is_present else OUTDATED
-    return " ".join(filter(None, (f"{title}{often}.", outdated, switched)))
+    return " ".join(filter(None, (f"{title}{light}{often}.", outdated, switched)))
 
 
 def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) -> dict[str, object]:

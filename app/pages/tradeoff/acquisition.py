@@ -7,7 +7,7 @@ from typing import Any
 
 import panel as pn
 
-from app.model.store import Answer, Request, same_subject
+from app.model.store import Answer, Request, same_capture, same_subject
 from app.pages.navigation import HOLDER
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
@@ -53,9 +53,7 @@ class AcquisitionSection(SettingsSection[Repetitions]):
 
     def __init__(self, session: Session) -> None:
         super().__init__(session, Repetitions(), text.ACQUISITION)
-        self.study = OnePiece(
-            session, self.work, self.draw, "captures", failed=self._describe_waiting
-        )
+        self.study = OnePiece(session, self.work, self.draw, "captures", failed=self._describe)
         self.subject = Sentence(
             text=text.NOT_SIMULATED, live=True, sizing_mode="stretch_width", margin=(4, 8)
         )
@@ -66,6 +64,7 @@ class AcquisitionSection(SettingsSection[Repetitions]):
             visible=False, stylesheets=[HOLDER], sizing_mode="stretch_width", margin=0
         )
         self._simulated = self._tried = session.answer.request
+        self._said = ""
         for each in self.cards:
             each.offer(session, self.about)
         self._required.offer(session, self.about)
@@ -95,14 +94,15 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         answer = self.session.answer
         if not same_subject(answer.request, self._tried):
             self.study.retry()
-        self._describe_waiting()
+        self._describe()
         self.study.show(self.is_on_screen and _applies(answer))
 
-    def _describe_waiting(self) -> None:
-        """State what happens before there are results."""
-        if self._results.visible:
-            return
-        if not _applies(self.session.answer):
+    def _describe(self) -> None:
+        """State what was simulated and whether it is outdated, or what happens before that."""
+        if self._said:
+            is_present = same_capture(self.session.answer.request, self._simulated)
+            self.subject.text = self._said if is_present else f"{self._said} {text.OUTDATED}"
+        elif not _applies(self.session.answer):
             self.subject.text = text.FIRST_PHOTONS_ONLY
         else:
             self.subject.text = text.FAILED if self.study.has_failed else text.NOT_SIMULATED
@@ -118,7 +118,7 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         request, source = self.session.answer.request, source_of(self.session.answer)
         repetitions = self.settings.repetitions
         self._tried = request
-        self._describe_waiting()
+        self._describe()
 
         def work(progress: Callable[[int, int], None]) -> tuple[Request, str, list[Any]]:
             affordable(source, ())
@@ -133,7 +133,8 @@ class AcquisitionSection(SettingsSection[Repetitions]):
 
     def draw(self, found: tuple[Request, str, list[Any]]) -> None:
         """Show a note on the simulation, the curves and the table."""
-        self._simulated, self.subject.text, (*curves, required) = found
+        self._simulated, self._said, (*curves, required) = found
+        self._describe()
         with self.session.tasks.hold():
             for each, curve in zip(self.cards, curves, strict=True):
                 each.show(curve)
