@@ -120,6 +120,7 @@ STYLES: dict[str, dict[str, object]] = {
         "major_tick_out": 3,
         "minor_tick_line_color": None,
     },
+    "BasicTickFormatter": {"power_limit_high": 9},  # counts of millions without an exponent
     "Legend": {
         "label_text_font": FONT,
         "label_text_font_size": "11px",

@@ -185,7 +185,8 @@ def enlarge(figure: Any) -> None:
 
 def _style(figure: Any, styles: Mapping[str, Mapping[str, object]]) -> None:
     """Apply the styles of each kind of model to a figure and its parts."""
-    for model in (figure, figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
+    axes = (each for axis in figure.axis for each in (axis, axis.formatter))
+    for model in (figure, figure.title, *axes, *figure.legend, *color_bars(figure)):
         for kind, sizes in styles.items():
             if isinstance(model, getattr(bokeh.models, kind)):
                 model.update(**sizes)
