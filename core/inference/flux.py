@@ -62,6 +62,7 @@ _LEAST_GAIN_IN_PROPORTION = 10.0  # of all pixels, for signals that depend on th
 _LEAST_JOINT_GAIN = 15.0  # of all pixels; without echoes it was at most 9 in 96 captures
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _MARGIN = 5  # times as many, which chance may leave instead
+_COUNTS_IN_PART, _FEWEST_PARTS = 3, 7  # of the gate, whose median rate is that of the background
 _CLEARLY_MORE = 2.0  # standard deviations of a total above the background, for which an echo fired
 _VARIANCE_OF_MEDIAN = math.pi / 2  # relative to that of the mean of a Gaussian
 _MANY_SPENT = 0.01  # share of the pixels with so few of them, which biases the mean total
@@ -546,19 +547,40 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
     Bins without armed pulses have no rate; theirs is taken as the median of the others, weighted
     with their armed pulses. That is the background if it fired the pulses, and nearly 0 if an echo
     did. Without this, flux that fires every pulse early in the gate would be mistaken for an echo.
+    Few pulses leave most bins empty at any background; the median is that of parts of the gate in
+    which a background that fires the pulses is detected.
 
     Where all fire in the first bin, its rate has only a lower bound, which is higher for all such
     pixels together than for one.
     """
-    median = np.empty(len(pixels))
+    median, n_parts = np.empty(len(pixels)), max(_FEWEST_PARTS, n_pulses // _COUNTS_IN_PART)
     for some in _some_rows(pixels):
         rate, armed = rate_and_n_armed(pixels[some].astype(float), n_pulses)
+        if n_parts < pixels.shape[1]:
+            rate, armed = _in_parts(rate, armed, n_parts)
         # The median of a Poisson variable is about 1/3 less than its mean.
         rate += 1 / (3 * np.maximum(armed, 1))
         median[some] = weighted_median(rate.T, armed.T)
     at_once = pixels[:, 0] >= n_pulses
     median[at_once] = math.log(2 * n_pulses * max(int(at_once.sum()), 1))
     return np.asarray(median * pixels.shape[1])
+
+
+def _in_parts(rate: Floats, armed: Floats, n_parts: int) -> tuple[Floats, Floats]:
+    """Join bins (pixel, bin) to parts of about as many armed pulses, shape (pixel, part).
+
+    Returns their mean rates, and their sums of armed pulses.
+    """
+    until = np.cumsum(armed, axis=1)
+    part = np.minimum(n_parts * (until - armed / 2) / until[:, -1:], n_parts - 1).astype(np.intp)
+    part += n_parts * np.arange(len(part))[:, np.newaxis]
+
+    def joined(values: Floats) -> Floats:
+        sums = np.bincount(part.ravel(), values.ravel(), n_parts * len(part))
+        return np.asarray(sums.reshape(-1, n_parts), float)
+
+    n_armed = joined(armed)
+    return joined(rate * armed) / np.maximum(n_armed, 1), n_armed
 
 
 def _some_rows(pixels: NDArray[Any]) -> Iterator[slice]:

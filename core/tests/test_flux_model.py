@@ -20,6 +20,7 @@ from core.inference.posterior import (
     posterior_of,
     tolerance_probability,
 )
+from core.inspection import estimate_mean_flux
 from core.metrics import restoration_degree
 from core.scene import Scene, scenes
 from core.simulation import simulate
@@ -245,6 +246,27 @@ def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
         background, abs=0.25 * variance / 2 + 4 * math.sqrt(variance / n_pixels)
     )
     assert total.var() == pytest.approx(variance, rel=0.25)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    ("signal", "background", "n_pulses"), [(0.6, 0.3, 20), (0.3, 0.7, 20), (0.6, 0.3, 10)]
+)
+def test_few_pulses_are_not_taken_for_a_strong_background(
+    signal: float, background: float, n_pulses: int
+) -> None:
+    """Most bins are then empty, also in pixels of which nearly all pulses fired."""
+    acquisition = Acquisition(n_bins=200, n_pulses=n_pulses)
+    scene = scenes["uniform"](size=SIZE)
+    capture = simulate(scene, acquisition, Flux(signal, signal / background), seed=1)
+    flux = estimate_mean_flux(capture)
+    variance = chance_variance(signal + background, n_pulses) / capture.counts.size
+    assert flux.signal.value == pytest.approx(signal, abs=4 * math.sqrt(variance))
+    assert flux.background.value == pytest.approx(background, abs=4 * math.sqrt(variance))
+    image = estimate(capture, "likelihood")
+    right = np.abs(image.range_m - scene.range_m) < 3 * acquisition.bin_length_m
+    assert image.confidence.mean() == pytest.approx(right.mean(), abs=0.03)
+    assert "unreliable" not in image.made_by.remark
 
 
 @pytest.mark.parametrize("exposure", [3, 4, 6])
