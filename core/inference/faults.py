@@ -4,7 +4,9 @@ Dead pixels may touch, as those of a dead column do: without any detection, a pi
 the background of the others, even a tenth of it, would have fired it.
 
 The excess of a hot pixel is spread over the gate. A pixel whose excess lies in an echo is not hot:
-it sees a bright surface.
+it sees a bright surface. So does one whose echo exceeds those of its neighbours by as large a
+factor as its background: a surface that reflects more of the pulse reflects more sunlight. For the
+same reason a pixel with counts is only dead if it has less than a tenth of any neighbour's.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ NEIGHBOURS = 3
 SIGNIFICANCE = 1e-6
 """Probability below which counts are not explained by chance."""
 
-_DIMMEST = 0.1  # background of a pixel relative to the mean
+_DIMMEST = 0.1  # background of a pixel relative to the mean, or its counts to a neighbour's
+_CLEARLY_MORE = 3.0  # standard deviations
 _DARKEST = 0.1  # share of the bins
 _ECHO_LENGTHS = 3  # an echo, and as many bins before and behind it
 
@@ -41,11 +44,11 @@ class OutlierPixels(NamedTuple):
     hot: NDArray[np.bool_]
     """Significantly more counts than any neighbour, spread over the gate."""
     bright: NDArray[np.bool_]
-    """Significantly more counts than any neighbour, in an echo."""
+    """Significantly more counts than any neighbour, in an echo, or in proportion to it."""
     dead: NDArray[np.bool_]
-    """Significantly fewer counts than any neighbour, and no echo; or none over a background."""
+    """No counts or less than a tenth of any neighbour's, and no echo; or none over a background."""
     dark: NDArray[np.bool_]
-    """Significantly fewer counts than any neighbour, and an echo."""
+    """Significantly fewer counts than any neighbour, but not dead."""
     most: NDArray[np.int64]
     """Largest counts of a neighbour."""
     least: NDArray[np.int64]
@@ -76,15 +79,24 @@ def outlier_pixels(capture: Capture) -> OutlierPixels | None:
     hot, dead = counts > most, counts < least
     hot[hot] = probability_of_more(counts[hot], most[hot], n_pulses) < SIGNIFICANCE
     dead[dead] = probability_of_fewer(counts[dead], least[dead], n_pulses) < SIGNIFICANCE
-    width = min(_ECHO_LENGTHS * capture.echo_bins, capture.acquisition.n_bins)
+    width = _width(capture)
     bright, dark = np.zeros((2, *capture.shape), bool)
     has_echo, beside = _echoes(capture.cube[hot], width, n_pulses)
     # Their excess lies in the echo: the other bins do not hold significantly more.
     bright[hot] = has_echo & (probability_of_more(beside, most[hot], n_pulses) >= SIGNIFICANCE)
-    dark[dead], _ = _echoes(capture.cube[dead], width, n_pulses)
+    for row, col in np.argwhere(hot)[has_echo]:
+        bright[row, col] = bright[row, col] or _is_brighter(capture, row, col, width)
+    has_echo, _ = _echoes(capture.cube[dead], width, n_pulses)
+    is_dim = probability_of_fewer(counts[dead], _DIMMEST * least[dead], n_pulses) >= SIGNIFICANCE
+    dark[dead] = has_echo | is_dim & (counts[dead] > 0)
     if math.exp(-_DIMMEST * _background_counts(capture)) < SIGNIFICANCE:
         dead |= counts == 0
     return OutlierPixels(hot & ~bright, bright, dead & ~dark, dark, most, least)
+
+
+def _width(capture: Capture) -> int:
+    """Bins of an echo and its surroundings."""
+    return min(_ECHO_LENGTHS * capture.echo_bins, capture.acquisition.n_bins)
 
 
 def _background_counts(capture: Capture) -> float:
@@ -116,6 +128,34 @@ def _echoes(
     return has_echo, np.maximum(counts - echo, 1).astype(np.int64)
 
 
+def _is_brighter(capture: Capture, row: int, col: int, width: int) -> bool:
+    """Return whether signal and background of a pixel exceed its neighbours' by the same factor.
+
+    The background may exceed them by less: that of the detector does not depend on the surface.
+    """
+    rows, cols = (slice(max(at - 1, 0), at + 2) for at in (row, col))
+    near = capture.cube[rows, cols]
+    own = np.ravel_multi_index((row - rows.start, col - cols.start), near.shape[:2])
+    histograms = near.reshape(-1, near.shape[2]).astype(float)
+    rate, armed = rate_and_n_armed(histograms, capture.gated_pulses)
+    each = np.arange(len(rate))
+    inside = windowed_sums(rate, width)
+    largest = inside.argmax(axis=1)
+    echo, total = inside[each, largest], rate.sum(axis=1)
+    variance = rate / np.maximum(armed, 1)
+    spread = windowed_sums(variance, width)[each, largest]
+    background = total - echo
+    signal = echo - background * width / max(rate.shape[1] - width, 1)
+    others = each != own
+    most = signal[own] - _CLEARLY_MORE * np.sqrt(spread[own] + spread[others])
+    if (signal[others] > most).any():
+        return False
+    s, b = signal[others].mean(), background[others].mean()
+    excess = background[own] * s - b * signal[own]
+    chance = background[own] ** 2 * spread[others].mean() / others.sum() + b**2 * spread[own]
+    return bool(excess <= _CLEARLY_MORE * math.sqrt(chance))
+
+
 def ordinary_pixels(capture: Capture) -> NDArray[np.bool_]:
     """Find the pixels that are neither hot nor dead, shape (row, col); all if there are none."""
     faulty = outlier_pixels(capture)
@@ -144,9 +184,13 @@ def pixel_verdict(capture: Capture, row: int, col: int) -> PixelVerdict:
     if found.hot[row, col]:
         health, why = "hot", "significantly more than any of them, spread over the gate"
     elif found.bright[row, col]:
-        why = "significantly more than any of them, in the echo of a bright surface"
+        why = "significantly more than any of them, with the echo of a bright surface"
     elif found.dark[row, col]:
+        has_echo, _ = _echoes(capture.cube[row, col][np.newaxis], _width(capture), n_pulses)
         why = "significantly fewer than any of them, with the echo of a dark surface"
+        if not has_echo[0]:
+            health = "cannot tell"
+            why = "significantly fewer than any of them, as on a dark surface or if less sensitive"
     elif found.dead[row, col]:
         why = "significantly fewer than any of them" if least > 0 else "no background fires it"
         health = "dead"

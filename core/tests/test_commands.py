@@ -79,7 +79,7 @@ def test_info_lists_hot_and_dead_pixels(tmp_path: Path, capsys: pytest.CaptureFi
     counts[1::3, 1:14:2] = 90  # no two beside each other
     counts[4, 4] = 0
     path = tmp_path / "worn.npz"
-    save_capture(Capture(counts, Acquisition(10, n_pulses=2000)), path)
+    save_capture(Capture(counts, Acquisition(10, n_pulses=200_000)), path)
     found = facts(capsys, "info", path)
     assert found["hot_pixels"] == len(found["hot_pixels_at"]) == 21
     assert found["dead_pixels_at"] == [

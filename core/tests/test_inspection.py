@@ -424,7 +424,7 @@ def test_a_bright_surface_in_one_pixel_is_not_hot(n_pulses: int | None) -> None:
     acquisition, pulse = replace(ACQUISITION, n_pulses=n_pulses), Pulse.gaussian(1e-9)
     onset, signal, dark_counts = np.full((7, 7), 30.3), np.full((7, 7), 0.02), np.zeros((7, 7))
     signal[1, 1] = signal[5, 5] = 0.5
-    dark_counts[5, 1] = dark_counts[5, 5] = 0.5
+    dark_counts[5, 1], dark_counts[5, 5] = 0.5, 3.0
     rate = rate_per_bin(onset, signal, 0.02, pulse, acquisition)
     rate = scale * (rate + dark_counts[..., np.newaxis] / acquisition.n_bins)
     cube = draw_counts(rate, n_pulses, np.random.default_rng(0))
@@ -433,6 +433,21 @@ def test_a_bright_surface_in_one_pixel_is_not_hot(n_pulses: int | None) -> None:
     assert {(each.row, each.col, each.health) for each in faulty} == {(5, 1, "hot"), (5, 5, "hot")}
     verdict = inspection.pixel_report(capture, estimate(capture, "peak"), 1, 1, "peak").verdict
     assert verdict.health == "ordinary" and "bright surface" in verdict.why
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("seed", range(4))
+def test_surfaces_of_uneven_reflectivity_in_the_sun_are_neither_hot_nor_dead(seed: int) -> None:
+    """Their signal and their background are in proportion to it."""
+    rng = np.random.default_rng(seed)
+    acquisition, pulse = Acquisition(n_bins=200, n_pulses=500), Pulse.gaussian(1.5e-9)
+    onset, reflectivity = rng.uniform(40, 42, (24, 24)), rng.lognormal(-1.0, 0.8, (24, 24))
+    rate = rate_per_bin(onset, 0.2 * reflectivity, 0.0, pulse, acquisition)
+    rate += 0.5 * reflectivity[..., np.newaxis] / acquisition.n_bins
+    capture = Capture(draw_counts(rate, acquisition.n_pulses, rng), acquisition, pulse)
+    assert inspection.faulty_pixels(capture) == []
+    found = outlier_pixels(capture)
+    assert found is not None and found.bright.any() and found.dark.any()
 
 
 def test_a_pixel_outside_the_image_is_refused() -> None:

@@ -215,6 +215,15 @@ def test_own_layout_lists_guesses_for_missing_fields(write: Write) -> None:
     assert capture.source == f"a wall; guessed: {guessed}"
 
 
+def test_more_photons_than_pulses_are_given_as_the_reason_to_count_all(write: Write) -> None:
+    counts = np.zeros((2, 2, 20), np.uint16)
+    counts[0, 1, 7:9] = 600, 700
+    named = {"bin_width_s": 5e-10, "pulse": "gaussian", "pulse_width_s": 1e-9}
+    capture = read_capture(write("a.npz", npz_bytes(cube=counts, n_pulses=1000, **named)))
+    assert capture.detection == "all"
+    assert "all photons of a pulse (as a pixel has 1,300 in 1,000 pulses)" in capture.source
+
+
 def test_own_layout_without_a_pulse_has_the_one_of_its_counts(write: Write) -> None:
     """As for other files, and stated in the same words."""
     slope = 30 + np.arange(20) / 2 + np.zeros((20, 1))

@@ -104,6 +104,9 @@ def description_of(
         found.append(f"pulse {shape} of {time_text(pulse.tau_s)}{certainty}")
     if request.detection is None:
         found.append("first photons only" if detection == "first" else "all photons of a pulse")
+        if detection == "all" and acquisition.n_pulses is not None:
+            most = counts.sum(axis=2, dtype=np.int64).max()
+            found[-1] += f" (as a pixel has {most:,} in {acquisition.n_pulses:,} pulses)"
     listed = f"guessed: {', '.join(found)}" if found else ""
     source = "; ".join(filter(None, (origin, listed, remark)))
     return Description(acquisition, pulse, detection, printable(source))
