@@ -15,8 +15,12 @@ distributed as background, wherever the surfaces lie and however many pixels hav
 of the shape is a sum of Legendre polynomials of the time in the gate, fitted to the counts of all
 pixels (iteratively reweighted least squares). Its degree maximises the likelihood minus a penalty
 for each polynomial (Ledwina 1994, "Data-driven version of Neyman's smooth test of fit"), so that a
-uniform background is found uniform but for `SIZE` of the captures. If every pixel has a second
-surface, part of it is taken for background; the goodness of fit (`core.inference.fit`) then warns.
+uniform background is found uniform but for `SIZE` of the captures.
+
+Surfaces that most pixels see in addition, as through a net or a pane, are not background. They show
+as peaks as wide as the pulse: where up to four echoes over a uniform background are likelier than
+the shape, both with their penalties, the background is taken as uniform, and the goodness of fit
+(`core.inference.fit`) warns. Such surfaces at many depths cannot be distinguished from background.
 """
 
 from __future__ import annotations
@@ -45,6 +49,11 @@ _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an ec
 _NOISE = 3.0  # standard deviations of a sum of squares
 _MOST_FIRING = 0.5  # of the pulses that reach a bin, for a rate that few of them decide
 _FEWEST_COUNTS = 0.5
+_PHASES = np.array([0.25, 0.75])  # of delays in a bin that are tried
+_MOST_ECHOES = 4  # of surfaces that pixels see in addition
+_MIXING_STEPS = 60
+_TINY = 1e-300  # instead of 0
+_END = 0.1  # of the gate, on either side
 _WIGGLES = 0.1  # of a slope, that are no second direction
 
 
@@ -150,14 +159,15 @@ def mean_background(free: EchoFree, is_first: bool, guess: Floats) -> float:
     return guess.size * (-math.log1p(-rate) if is_first else rate)
 
 
-def fitted_shape(free: EchoFree) -> Floats | None:
+def fitted_shape(free: EchoFree, capture: Capture) -> Floats | None:
     """Fit the background shape to the counts in bins without an echo.
 
     Returns
     -------
     ndarray, shape (bin,), or None
-        None if the counts do not contradict a uniform background, or if the shape explains less of
-        the contradiction than it leaves: echoes of another kind, not background.
+        None if the counts do not contradict a uniform background, if the shape explains less of the
+        contradiction than it leaves, or if a few echoes explain more: other surfaces, and not
+        background.
     """
     seen, expected = free.counts, free.expected
     basis = _polynomials(seen.size)
@@ -181,7 +191,63 @@ def fitted_shape(free: EchoFree) -> Floats | None:
     left = float(((seen[is_seen] - mean) ** 2 / mean - 1).sum())
     noise = _NOISE * math.sqrt(2 * mean.size)
     is_smooth = left - noise < float((found[1:n] ** 2).sum())
-    return np.asarray(shape / shape.mean()) if is_smooth else None
+    if not is_smooth or _echo_misfit(free, capture) < _misfit(seen, expected * shape, n - 1):
+        return None
+    return np.asarray(shape / shape.mean())
+
+
+def _misfit(seen: Floats, mean: Floats, n_terms: int) -> float:
+    """Twice the negative log likelihood of counts (bin,), with a penalty for each term."""
+    excess = scipy.special.kl_div(seen, np.maximum(mean, _TINY)).sum()
+    return 2 * float(excess) + _PENALTY * n_terms
+
+
+def _echo_misfit(free: EchoFree, capture: Capture) -> float:
+    """Return the least `_misfit` of up to `_MOST_ECHOES` echoes over a uniform background.
+
+    Echoes of a surface that many pixels see have the shape of the pulse, scattered light and
+    ambient light are broader. Only at the beginning of the gate scattered light may be as short.
+    """
+    components, least = free.expected[np.newaxis], math.inf
+    for n_echoes in range(_MOST_ECHOES + 1):
+        mean = np.maximum(_mixed(free.counts, components), _TINY)
+        least = min(least, _misfit(free.counts, mean, 2 * n_echoes))
+        components = np.vstack([components, _next_echo(free, mean, capture)])
+    return least
+
+
+def _next_echo(free: EchoFree, mean: Floats, capture: Capture) -> Floats:
+    """Expected counts (bin,) of the echo of a photon that the residuals show most significantly.
+
+    By the score test of its photons, ``(Σ_k c_k (n_k / μ_k - 1))² / Σ_k c_k² / μ_k``.
+    """
+    n_bins = mean.size
+    echoes, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, _PHASES)
+    slope, bend = free.armed * (free.counts / mean - 1), free.armed**2 / mean
+    along = np.stack([_correlated(slope, echo, first) for echo in echoes])
+    across = np.stack([_correlated(bend, echo**2, first) for echo in echoes])
+    score = np.maximum(along, 0.0) / np.sqrt(np.maximum(across, _TINY))
+    score[:, : capture.echo_bins] = 0.0
+    phase, delay = np.unravel_index(score.argmax(), score.shape)
+    at_delay = np.zeros(n_bins)
+    at_delay[delay] = 1.0
+    return free.armed * _correlated(at_delay, echoes[phase, ::-1], 1 - first - len(echoes[phase]))
+
+
+def _correlated(values: Floats, taps: Floats, first: int) -> Floats:
+    """Compute ``Σ_t taps_t values_(k + first + t)`` for each bin k, shape (bin,)."""
+    padded = np.pad(values, (max(-first, 0), max(first, 0) + taps.size - 1))
+    return np.correlate(padded, taps, "valid")[max(first, 0) :][: values.size]
+
+
+def _mixed(counts: Floats, components: Floats) -> Floats:
+    """Fit counts (bin,) by a mixture of components (component, bin), by maximum likelihood."""
+    area = np.maximum(components.sum(axis=1), _TINY)
+    share = np.full(len(area), counts.sum() / area.size) / area
+    for _ in range(_MIXING_STEPS):
+        mean = np.maximum(np.vecmat(share, components), _TINY)
+        share = share * np.matvec(components, counts / mean) / area
+    return np.asarray(np.vecmat(share, components))
 
 
 @lru_cache(maxsize=16)
@@ -191,6 +257,15 @@ def _polynomials(n_bins: int) -> Floats:
     time = (2 * np.arange(n_bins) + 1) / n_bins - 1
     norm = np.sqrt(2 * np.arange(degree + 1.0) + 1)
     return np.asarray(np.polynomial.legendre.legvander(time, degree) * norm, float)
+
+
+def peaks_inside(shape: Floats) -> bool:
+    """Return whether a background shape (bin,) is largest at neither end of the gate.
+
+    Scattered light and afterglow fall from its beginning.
+    """
+    end = max(1, round(_END * shape.size))
+    return bool(end <= shape.argmax() < shape.size - end)
 
 
 def shape_text(shape: Floats | None) -> str:

@@ -70,7 +70,6 @@ _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
 _MOST_AT_ECHOES = 1.5  # of the mean background; with more, one may be taken for the other
 _MOST_RISE = 1.1  # of that from the first round to the last; up to 1.02 if it is background
-_END = 0.1  # of the gate, on either side
 _LONGER = 3.0, 6.0  # times the pulse, with which echoes may explain a shape of the background
 _RARE = 1e-3  # levels with a smaller share are left out
 _TINY = 1e-30  # likelihood of a level relative to the likeliest, whose logarithm is finite
@@ -150,13 +149,12 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     hand, the shape may consist of photons of echoes that are longer than the pulse. Then longer
     echoes over a uniform background are likelier, or the shape rises at the echoes from round to
     round: echoes over a larger background explain fewer photons. A background does not depend on
-    the one that is assumed. Or they are photons of second surfaces, where the shape is largest
-    inside the gate; scattered light and afterglow fall from its beginning.
+    the one that is assumed.
     """
     uniform, shapes = _flux_prior(capture, None)
     if not shapes:
         return uniform
-    first, is_doubtful = shapes[0], _at_echoes(shapes[0], uniform) > _MOST_AT_ECHOES
+    first = shapes[0]
     if len(shapes) == 1:
         found, shapes = _flux_prior(capture, first)
     else:
@@ -172,8 +170,7 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     at_echoes = _at_echoes(found.relative_background, found)
     has_risen = at_echoes > _MOST_RISE * _at_echoes(first, found)
     is_of_echoes = at_echoes > _MOST_AT_ECHOES and has_risen
-    is_of_surfaces = is_doubtful and _peaks_inside(found.relative_background)
-    return uniform if is_of_echoes or is_of_surfaces else found
+    return uniform if is_of_echoes else found
 
 
 def _of_longer_echoes(capture: Capture) -> float:
@@ -185,12 +182,6 @@ def _of_longer_echoes(capture: Capture) -> float:
         as_if = replace(capture, pulse=longer)
         likelihoods.append(_log_likelihood(as_if, _flux_prior(as_if, None)[0]))
     return max(likelihoods)
-
-
-def _peaks_inside(shape: Floats) -> bool:
-    """Return whether a background shape is largest at neither end of the gate."""
-    end = max(1, round(_END * shape.size))
-    return bool(end <= shape.argmax() < shape.size - end)
 
 
 def _at_echoes(shape: Floats, flux_prior: FluxPrior) -> float:
@@ -223,14 +214,14 @@ def _background(
     guess, background = known.relative_background, flux.background[:, 0].T
     free = echo_free(density, known.share[:, np.newaxis] * known.depth, background, *seen, guess)
     mean = mean_background(free, n_pulses is not None, guess)
-    shape = fitted_shape(free) if pixels.size >= _FEWEST_OF_SHAPE else None
+    shape = fitted_shape(free, capture) if pixels.size >= _FEWEST_OF_SHAPE else None
     if shape is None:
         return _Background(mean, ())
     if known.background_shape is not None or _at_echoes(shape, known) <= _MOST_AT_ECHOES:
         return _Background(mean, (shape,))
     alone = np.ones((pixels.size, 1, n_bins), np.float32)
     everything = echo_free(alone, np.ones((1, n_bins)), background[:, :1], *seen, guess)
-    other = fitted_shape(everything)
+    other = fitted_shape(everything, capture)
     return _Background(mean, (shape,) if other is None else (shape, other))
 
 

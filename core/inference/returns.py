@@ -378,7 +378,7 @@ def _background_shares(capture: Capture) -> Floats:
     armed = rate_and_n_armed(counts.astype(float), capture.gated_pulses)[1]
     expected = armed * found.background[:, np.newaxis] * uniform
     sums = (np.where(free, each, 0.0).sum(axis=0) for each in (counts, expected, armed))
-    shape = fitted_shape(EchoFree(*sums))
+    shape = fitted_shape(EchoFree(*sums), capture)
     return uniform if shape is None else shape / n_bins
 
 

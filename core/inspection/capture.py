@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Capture, cached_per_capture
-from core.inference.background import shape_text
+from core.inference.background import peaks_inside, shape_text
 from core.inference.faults import outlier_pixels
 from core.inference.flux import flux_prior_of
 from core.inference.posterior import TOLERANCE_BINS
@@ -128,8 +128,8 @@ def _flux_remark(capture: Capture, found: MeanFlux) -> str:
             f"bins {_text(found.model.background)}: "
         )
         remark += (
-            "they disagree, and the intervals include both. The background may vary along the "
-            "gate, or echoes have another shape than the pulse."
+            "they disagree, and the intervals include both. Pixels may see several surfaces, the "
+            "background may vary along the gate, or echoes have another shape than the pulse."
             if found.is_contradicted
             else "they agree."
         )
@@ -137,6 +137,8 @@ def _flux_remark(capture: Capture, found: MeanFlux) -> str:
         remark += f" The echoes are {wide} times as long as the pulse, which does not fit."
     if (shape := flux_prior_of(capture).background_shape) is not None:
         remark += f" According to bins without echoes, {shape_text(shape)}; estimates allow for it."
+        if peaks_inside(shape):
+            remark += " Further surfaces at many depths would look the same."
     return remark
 
 

@@ -80,9 +80,9 @@ class MeanFlux(NamedTuple):
     model: FluxEstimate
     """The image's by the likelihood alone."""
     free: FluxEstimate | None
-    """The image's by the bins without echoes alone (`core.inspection.echoes.echo_free_flux`). If
-    they are unknown, by the darkest tenth of the gate where that contradicts the likelihood
-    (`core.inspection.echoes.darkest_flux`)."""
+    """The image's by the bins without echoes alone (`core.inspection.echoes.echo_free_flux`). By
+    the darkest tenth of the gate where that contradicts these bins over a uniform background or, if
+    they are unknown, the likelihood (`core.inspection.echoes.darkest_flux`)."""
     pulse: Pulse
     """The capture's, or the one that fits the echoes clearly better
     (`core.inspection.pulse_fit`)."""
@@ -165,9 +165,28 @@ def _mean_flux(capture: Capture) -> MeanFlux:
         sbr = ratio_of(signal, whole.background)
         target = FluxEstimate(signal, whole.background, sbr)
     free, darkest = echo_free_flux(capture), darkest_flux(capture)
-    is_darkest = bool(free is None and darkest and darkest.background.high < whole.background.low)
-    free = darkest if is_darkest else free
-    return _combined(MeanFlux(whole, target, whole, free, mixture.pulse, is_darkest))
+    by_free = _combined(MeanFlux(whole, target, whole, free, mixture.pulse))
+    # Bins before and after the echoes that are found may hold those of another surface. Where the
+    # background varies, a window may instead be darker than a smooth shape.
+    is_smooth = free is not None and detailed_flux_prior_of(capture).background_shape is not None
+    most = (free or whole).background.low
+    if is_smooth or darkest is None or darkest.background.high >= most:
+        return by_free
+    by_darkest = _combined(by_free._replace(image=whole, target=target, free=darkest))
+    return by_darkest._replace(
+        image=_joined(by_darkest.image, by_free.image),
+        target=_joined(by_darkest.target, by_free.target),
+        is_darkest=True,
+    )
+
+
+def _joined(found: FluxEstimate, other: FluxEstimate) -> FluxEstimate:
+    """Return fluxes with intervals that include others."""
+    return FluxEstimate(
+        found.signal.joined(other.signal),
+        found.background.joined(other.background),
+        found.sbr.joined(other.sbr),
+    )
 
 
 def _below_total(signal: Interval, total: Interval) -> FluxEstimate:
@@ -212,7 +231,7 @@ def _combined(found: MeanFlux) -> MeanFlux:
         signal = _at_same_share(target.signal, model.signal, free.signal)
         sbr = ratio_of(signal, free.background)
         return found._replace(image=free, target=FluxEstimate(signal, free.background, sbr))
-    image = FluxEstimate(*(one.joined(other) for one, other in zip(free, model, strict=True)))
+    image = _joined(free, model)
     # The same share of the pixels has an echo.
     factor = free.signal.value / model.signal.value if model.signal.value > 0 else 1.0
     signal = target.signal.scaled(factor)

@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from core.acquisition import Acquisition, Pulse
+from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
+from core.effects import SecondSurface
 from core.estimators import estimate
 from core.estimators.base import histogram_numbers
 from core.inference.background import SIZE, echo_free, nodes_of, shape_text
 from core.inference.fit import fit_of
 from core.inference.flux import flux_prior_of
-from core.inspection import capture_report
+from core.inspection import capture_report, estimate_mean_flux
+from core.scene import Scene, net
+from core.simulation import simulate
 from core.studies.methods import alarms
 from core.studies.methods.calibration import FluxRegime, confidence_and_right
 from core.studies.methods.fit import NULL_CASES
@@ -230,3 +233,47 @@ def test_much_longer_echoes_are_not_taken_for_background() -> None:
     rate = rate_per_bin(onset, np.ones(onset.shape), 0.3, Pulse(6e-9), acquisition)
     capture = Capture(draw_counts(rate, 100, rng), acquisition, Pulse())
     assert flux_prior_of(capture).background_shape is None
+
+
+def with_two_surfaces(width_s: float, sbr: float, *, is_flat: bool) -> Capture:
+    """Capture of a pane that all pixels see before a scene, both as bright."""
+    rng, gate = np.random.default_rng(0), Acquisition(n_pulses=1000)
+    behind = np.full((32, 32), 60.7) if is_flat else rng.uniform(48, 60, (32, 32))
+    pane_m, behind_m = map(gate.bin_to_range_m, (np.full((32, 32), 30.3), behind))
+    scene = Scene(pane_m, second_surface=SecondSurface(behind_m, np.full((32, 32), 0.5)))
+    return simulate(scene, gate, Flux(0.1, sbr), Pulse(width_s))
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    "capture",
+    [
+        simulate(net(32, 15.0), Acquisition(n_pulses=1000), Flux(0.1, 0.3), Pulse(0.5e-9)),
+        simulate(net(32), Acquisition(n_pulses=1000), Flux(0.1, 0.3), Pulse(1e-9)),
+        with_two_surfaces(3e-9, 0.3, is_flat=True),
+        with_two_surfaces(1e-9, 0.3, is_flat=False),
+    ],
+)
+def test_a_surface_that_all_pixels_see_besides_another_is_not_taken_for_background(
+    capture: Capture,
+) -> None:
+    assert flux_prior_of(capture).background_shape is None
+    flux = estimate_mean_flux(capture)
+    assert flux.signal.low <= 0.1 <= flux.signal.high
+    assert flux.background.low <= 0.1 / 0.3 <= flux.background.high
+    returns = estimate(capture, "likelihood", returns=2).returns
+    assert returns is not None
+    has_two = returns.count(capture.shape)[returns.row, returns.col] == 2
+    assert has_two.mean() > 0.9
+    assert np.quantile(returns.confidence[has_two], 0.1) > 0.9
+
+
+@pytest.mark.compiled
+def test_a_cloud_longer_than_the_pulse_is_background() -> None:
+    at = np.arange(100) + 0.5
+    shape = 1 + 0.6 * np.exp(-(((at - 40) / 6) ** 2) / 2)
+    capture = drawn(shape, (55.0, 85.0))
+    found = flux_prior_of(capture).background_shape
+    assert found is not None
+    assert np.sqrt(((found / shape * shape.mean() - 1) ** 2).mean()) < 0.03
+    assert "would look the same" in capture_report(capture).flux_remark
