@@ -63,6 +63,24 @@ def test_frames_are_no_cube(no_trigger: int, dtype: str, name: str, write: Write
     assert read_capture(path, no_trigger=no_trigger).acquisition.n_pulses == 40
 
 
+@pytest.mark.parametrize("name", ["f.npy", "f.npz"])
+def test_nan_in_frames_marks_no_trigger(name: str, write: Write) -> None:
+    def stored(stack: NDArray[Any]) -> Path:
+        return write(name, npy_bytes(stack) if name.endswith("npy") else npz_bytes(data=stack))
+
+    stack = np.where(FRAMES < 0, np.nan, FRAMES)[:40]
+    path = stored(stack)
+    with pytest.raises(CaptureError, match=r"give -1 if .* in which NaN marks no trigger") as asked:
+        read_capture(path)
+    assert asked.value.choices == {"Raw frames": {"no_trigger": "-1"}}
+    assert "in which NaN marks no trigger" in asked.value.question
+    found = read_capture(path, no_trigger=-1)
+    whole = read_capture(stored(FRAMES[:40]), no_trigger=-1)
+    np.testing.assert_array_equal(found.cube, whole.cube)
+    with pytest.raises(CaptureError, match="round times in bins down"):
+        read_capture(stored(stack + 0.25), no_trigger=-1)
+
+
 def camera_frames(share: float, n_pulses: int) -> NDArray[np.uint8]:
     """Frames of 32 x 32 pixels, each with a target of its own, in which 0 marks no trigger."""
     rng = np.random.default_rng(0)
@@ -288,7 +306,6 @@ REFUSED: tuple[tuple[str, bytes, dict[str, Any], str], ...] = (
     ),
     ("f.npy", changed(-2, np.int32), OTHERS, IN_PULSE_7 + "-2 .*0 to 65535"),
     ("f.npy", changed(1.5), OTHERS, IN_PULSE_7 + "1.5"),
-    ("f.npy", changed(np.nan), OTHERS, IN_PULSE_7 + "nan"),
     ("f.npy", changed(1e300), OTHERS, TOO_MANY),
     ("f.npy", changed(2**16, np.int32), OTHERS, IN_PULSE_7 + "65536 .*0 to 65535"),
     ("f.npy", npy_bytes(FRAMES), {"no_trigger": 255}, "= -1 .*255"),

@@ -8,7 +8,8 @@ Each frame is one pulse, and each pixel triggers once in it or never: these are 
 many pulses as frames. Without ``n_bins`` the gate ends with the last trigger, which may lie in one
 of the first 65,536 bins: a larger number more likely stands for no trigger. Each frame is a record:
 ``records`` counts some of them, in the gate of all. With ``pulse_groups`` the order of the pulses
-is kept in so many groups, each with a cube of its own, all of which must fit.
+is kept in so many groups, each with a cube of its own, all of which must fit. In frames of
+floating-point numbers NaN marks no trigger, too.
 """
 
 from __future__ import annotations
@@ -177,13 +178,17 @@ def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
     Raises
     ------
     AmbiguousError
-        If one value hardly is a count, and thus probably marks the pulses without a trigger: the
-        least one if that is negative, or the largest one if it is frequent everywhere. Without
+        If one value hardly is a count, and thus probably marks the pulses without a trigger: NaN,
+        the least one if that is negative, or the largest one if it is frequent everywhere. Without
         `axes` also if `core.io.readers.frame_guess` takes 0 for that value.
     """
     if array.ndim != 3 or not array.size or array.dtype.kind not in "iuf":
         return
     frames = f"raw frames ({', '.join(AXES)})"
+    is_marked = array.dtype.kind == "f" and np.isnan(array).mean() > _MARKED
+    if is_marked and "pulse" in (axes or AXES):
+        why = f"if {name} holds {frames}, in which NaN marks no trigger"
+        raise _are_frames(-1, why, mark="NaN")
     least, largest = array.min().item(), array.max().item()
     for value in (least, largest):
         if _hardly_counts(array, value):
@@ -215,13 +220,19 @@ def _hardly_counts(array: NDArray[Any], value: float) -> bool:
 
 
 def _are_frames(
-    no_trigger: float, why: str, others: Mapping[str, Mapping[str, str]] = MappingProxyType({})
+    no_trigger: float,
+    why: str,
+    others: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
+    mark: str | None = None,
 ) -> AmbiguousError:
-    """Return the error that asks whether an array holds raw frames, or one of `others`."""
+    """Return the error that asks whether an array holds raw frames, or one of `others`.
+
+    `mark` names what marks no trigger, by default `no_trigger`.
+    """
     return AmbiguousError(
         f"no_trigger = None is not accepted: give {no_trigger:.0f} {why}.",
-        "{file} seems to hold raw frames (" + ", ".join(AXES) + f"), in which {no_trigger:.0f} "
-        "marks no trigger. What does it hold?",
+        "{file} seems to hold raw frames (" + ", ".join(AXES) + "), in which "
+        f"{mark or format(no_trigger, '.0f')} marks no trigger. What does it hold?",
         {"Raw frames": {"no_trigger": f"{no_trigger:.0f}"}, **others},
     )
 
@@ -246,6 +257,8 @@ def _count_triggers(
     end = first_bin + (n_bins or MOST_GUESSED_BINS)
     for start, frames in stretches:
         fired = frames != no_trigger
+        if frames.dtype.kind == "f":
+            fired &= ~np.isnan(frames)
         numbers = frames[fired]
         odd = (numbers < first_bin) | (numbers >= end) | (numbers != np.floor(numbers))
         if odd.any():
@@ -254,6 +267,8 @@ def _count_triggers(
             what = f"{name} in pulse {pulse}, pixel ({row}, {col})"
             limited = "(more with n_bins)" if n_bins is None else f"for n_bins = {n_bins}"
             accepted = f"{first_bin} to {end - 1} {limited}, or {no_trigger} where nothing fired"
+            if (numbers != np.floor(numbers)).any():
+                accepted += "; round times in bins down to whole ones"
             require(what, numbers[odd][0].item(), False, accepted)
         if not numbers.size:
             continue

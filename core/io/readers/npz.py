@@ -145,7 +145,8 @@ def read(path: Path, request: ReadOptions) -> Capture:
             if complete.no_trigger is None:
                 value = number(known, "no_trigger")
                 whole = value is not None and value.is_integer()
-                require("no_trigger", value, whole, "a whole number, the value for no trigger")
+                accepted = "a whole number, the value for no trigger; -1 if that is NaN"
+                require("no_trigger", value, whole, accepted)
                 complete = replace(complete, no_trigger=int(value or 0))
             size = archive.getinfo(f"{name}.npy").file_size
             with _opened(archive, name, may_be_large=True) as file:
