@@ -54,7 +54,7 @@ class RangeCandidate:
     range_m: float
     range_low_m: float
     """Lower limit of the 95 % interval of the range, if there is a surface within 3 bins, or within
-    half the length of a longer pulse."""
+    half the length of a longer pulse. Extended to `range_m`, except for the estimate."""
     range_high_m: float
     """Upper limit, likewise."""
     score: float
@@ -346,9 +346,12 @@ def _candidates(
     elif is_estimate.any():
         confidence = float(probability[is_estimate][0])
     range_m = capture.acquisition.bin_to_range_m(bins)
-    interval_m = delay_range_interval(capture, image, row, col, bins)
+    low_m, high_m = delay_range_interval(capture, image, row, col, bins)
+    # The score of another method may have its maximum where the posterior has none.
+    low_m = np.where(is_estimate, low_m, np.minimum(low_m, range_m))
+    high_m = np.where(is_estimate, high_m, np.maximum(high_m, range_m))
     relative = (score - base) / (score[0] - base)
-    columns = (bins, range_m, *interval_m, score, relative, probability)
+    columns = (bins, range_m, low_m, high_m, score, relative, probability)
     found = tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
     return found, confidence
 

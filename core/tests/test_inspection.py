@@ -183,6 +183,16 @@ def test_the_candidate_at_the_estimate_is_the_estimate(method: str, settings: An
             assert each.probability == report.confidence
 
 
+@pytest.mark.parametrize("method", ["tracking", "peak"])
+def test_candidates_other_than_the_estimate_lie_within_their_intervals(method: str) -> None:
+    capture = seen(0.3, 0.3)
+    image = estimate(capture, method)
+    for row, col in np.ndindex(8, 8):
+        report = inspection.pixel_report(capture, image, row, col, method)
+        others = [each for each in report.candidates if each.bin != report.answer_bin]
+        assert all(each.range_low_m <= each.range_m <= each.range_high_m for each in others)
+
+
 def test_a_pixel_far_below_the_mean_signal_has_candidates() -> None:
     taps = np.diff(stats.norm.cdf(np.arange(61), 40.5, 1.5))
     signal = np.where(np.arange(32).reshape(4, 8) == 0, 5e3, 2e4)
