@@ -142,7 +142,7 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
         least = solved(_states(log, prior), prior, agreement).nothing
         most = min(_LIKELY, float(np.quantile(least[present[0]], false_return)))
         present[1] &= (second.nothing < most) & _apart(delay)
-    seen = _presence(_log_ratios(image, fluxes, 1, delay[0], only, _ALIKE), delay[1])
+    seen = _presence(_log_ratios(image, fluxes, 1, delay[0], only, share[1:]), delay[1])
     present[1] &= seen > _LIKELY
     confidence = np.stack(
         [_mass(first, delay[0]), np.minimum(_mass(second.surface, delay[1]), seen)]
@@ -154,9 +154,10 @@ def image_layers_of(capture: Capture, false_return: float = FALSE_RETURN) -> Lay
 def _presence(log: NDArray[np.float32], delay: Floats) -> Floats:
     """Return the probability that each pixel has a surface where its neighbours do, (row, col).
 
-    They tell where it is. How many around have one is learned from the evidence of each pixel by
+    They show where it is. How many around have one is learned from the evidence of each pixel by
     itself, log likelihood ratios (row, col, bin), since neighbours may well differ in that, as in
-    foliage.
+    foliage. The evidence must be that of signals as strong as the capture's second surfaces:
+    that of fainter ones hardly differs from that of none.
     """
     away = np.abs(np.arange(log.shape[2]) + 0.5 - delay[..., np.newaxis]) > _LEAST_DISTANCE_BINS
     evidence = np.where(away, -np.inf, log).max(axis=2).astype(float)
