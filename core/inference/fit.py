@@ -10,13 +10,17 @@ normal number, for any number of photons, and the sum of their squares gives the
 A draw leaves out the first and the last thousandth of an echo, so that echoes of 10⁷ photons never
 fit.
 
+Draws from a posterior are distributed as the truth if the prior is that of the pixels. Before the
+counts are known, any bin is as likely, but not any place in it: on a wall that faces the instrument
+all echoes begin at the same. How often they begin at each place is learned from the capture.
+
 Residuals of many pixels together show what one pixel cannot: those away from the echoes, by bin of
 the gate, the shape of the background, those around the echoes the shape of the pulse.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
@@ -33,8 +37,9 @@ from core.inference.likelihood import (
     pixels_of,
     prepare,
 )
-from core.kernels.echo_draws import UNIFORMS, redraw
+from core.kernels.echo_draws import UNIFORMS, fill_delay_logs, redraw
 from core.kernels.parallel import on_threads
+from core.kernels.posterior import learn_shares
 from core.kernels.streams import uniforms
 
 SIGNIFICANCE = 0.01
@@ -47,6 +52,8 @@ _WINDOWS = 16  # of the gate, at most, whose counts are tested in each pixel
 GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
 FEWEST = 5.0  # expected counts of a group, for a normal sum
 _STEPS_PER_BIN = 128  # delays at which an echo is tabulated
+_PHASES = 64  # of delays in a bin
+_DELAY_COST = 20  # counts that other kernels process in the time of one delay
 _SEED = np.uint64(0)
 
 
@@ -125,8 +132,13 @@ class Deviation(NamedTuple):
 @cached_per_capture
 def fit_of(capture: Capture) -> Fit:
     """Test the model on the pixels from which the fluxes are estimated; on fewer in a long gate."""
+    return fit_in(capture, _sample(capture))
+
+
+def _sample(capture: Capture) -> NDArray[np.intp]:
+    """Return the pixels from which the fluxes are estimated, of which few in a long gate."""
     drawn = np.random.default_rng(0).permutation(capture.counts.size)[:SAMPLE]
-    return fit_in(capture, np.sort(drawn[: _most_at_once(capture)]))
+    return np.sort(drawn[: _most_at_once(capture)])
 
 
 def has_fit(capture: Capture) -> bool:
@@ -258,6 +270,60 @@ def _drawn(
     streams: NDArray[np.intp],
 ) -> tuple[Floats, Floats, Floats]:
     """Draw delay (NaN for no echo), signal, and background per bin of pixels, (pixel,) each."""
+    given, state = _drawn_at_any_phase(capture, pixels, cube, streams)
+    if (shares := _phase_shares(capture)) is not None:
+        delay, log = _delay_logs(given, state)
+        density = np.exp(log - log.max(axis=1, keepdims=True)) * np.resize(shares, log.shape[1])
+        uniform = uniforms(_SEED, streams, UNIFORMS + 3 + _WINDOWS, 1)
+        chosen = _drawn_index(np.cumsum(density, axis=1)[..., np.newaxis], uniform)
+        state[:, 0] = np.take_along_axis(delay, chosen, axis=1)[:, 0]
+    return state[:, 0], np.exp(state[:, 1]), np.exp(state[:, 2])
+
+
+@cached_per_capture
+def _phase_shares(capture: Capture) -> Floats | None:
+    """Estimate how often delays are at each phase of a bin, shape (phase,).
+
+    None if any phase is as likely: the gain in log likelihood does not exceed the number of phases
+    (Akaike 1974).
+    """
+    pixels = _sample(capture)
+    cube = capture.cube.reshape(-1, capture.acquisition.n_bins)[pixels]
+    log = _delay_logs(*_drawn_at_any_phase(capture, pixels, cube, pixels))[1]
+    density = np.exp(log - log.max(axis=1, keepdims=True)).reshape(pixels.size, -1, _PHASES)
+    at_phase = density.sum(axis=1)
+    at_any = at_phase.mean(axis=1, keepdims=True)
+    likelihood = np.hstack([at_any, at_phase]) / at_any
+    share = np.full(1 + _PHASES, 1 / (1 + _PHASES))
+    learn_shares(likelihood, share)
+    gain = np.log(likelihood @ share).sum()
+    return share[0] / _PHASES + share[1:] if gain > _PHASES else None
+
+
+def _delay_logs(given: tuple[Any, ...], state: Floats) -> tuple[Floats, Floats]:
+    """Return equidistant delays around drawn ones and the logarithms of their densities.
+
+    Both of shape (pixel, delay), at `_PHASES` in each of three bins. The densities are posterior
+    ones given drawn signal and background, if any delay is as likely before.
+    """
+    every = (np.arange(3 * _PHASES) + 0.5) / _PHASES - 1
+    delay = np.floor(state[:, :1]) + every
+    log = np.empty(delay.shape)
+    on_threads(fill_delay_logs, len(log), log.size * _DELAY_COST, *given, state, delay, log)
+    return delay, log
+
+
+def _drawn_at_any_phase(
+    capture: Capture,
+    pixels: NDArray[np.intp],
+    cube: NDArray[np.unsignedinteger],
+    streams: NDArray[np.intp],
+) -> tuple[tuple[Any, ...], Floats]:
+    """Draw delays (NaN for no echo), logarithms of signals and of backgrounds per bin, (pixel, 3).
+
+    Any delay is as likely before the counts are known. Returns what the kernels of
+    `core.kernels.echo_draws` need to know before the draws.
+    """
     n_bins = cube.shape[1]
     flux = flux_model_of(capture).of_pixels(pixels[np.newaxis])
     prepared = prepare(capture, cube[np.newaxis], flux, 1)
@@ -268,19 +334,22 @@ def _drawn(
     echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, steps)
     log_signal = np.log(np.where(level > 0, signal, 1.0))
     state = np.stack([delay_bin, log_signal, np.log(background / n_bins)], axis=1)
+    given = (
+        cube.astype(np.uint32),  # compiled for one type of counts
+        capture.gated_pulses or 0,
+        echo,
+        first,
+        (flux.relative_background, *nodes_of(flux.relative_background)),
+    )
     on_threads(
         redraw,
         len(cube),
         cube.size * UNIFORMS,  # a pass over the counts for every number drawn
-        cube.astype(np.uint32),  # compiled for one type of counts
-        capture.gated_pulses or 0,
+        *given,
         streams,
-        echo,
-        first,
-        (flux.relative_background, *nodes_of(flux.relative_background)),
         state,
     )
-    return state[:, 0], np.exp(state[:, 1]), np.exp(state[:, 2])
+    return given, state
 
 
 def _drawn_levels(prepared: LikelihoodInput, uniform: Floats) -> tuple[Floats, NDArray[np.intp]]:

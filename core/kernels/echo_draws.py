@@ -79,7 +79,7 @@ def _chosen(log_weight, uniform):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def redraw(  # type: ignore[no-untyped-def]
-    first, end, counts, n_pulses, pixels, echo, first_tap, background, state
+    first, end, counts, n_pulses, echo, first_tap, background, pixels, state
 ):
     """Replace the states (pixel, 3) by other draws: delay, log signal, and log background per bin.
 
@@ -122,3 +122,24 @@ def redraw(  # type: ignore[no-untyped-def]
                 break
             if is_inside:
                 scale /= _SHRINKING
+
+
+@njit(**COMPILED)
+def fill_delay_logs(  # type: ignore[no-untyped-def]
+    first, end, counts, n_pulses, echo, first_tap, background, state, delay, log
+):
+    """Fill the logarithms of the posterior densities of other delays of pixels, (pixel, delay).
+
+    Given signal and background of `state`; all but `delay` (pixel, delay) as for `redraw`.
+    """
+    shape, node, node_weight = background
+    for pixel in range(first, end):
+        fired = counts[pixel].astype(np.float64)
+        unfired = n_pulses - np.cumsum(fired) if n_pulses > 0 else np.ones(fired.size)
+        sums = (node_weight * fired).sum(axis=1), (shape * unfired).sum()
+        at, start = state[pixel].copy(), state[pixel]
+        for i in range(delay.shape[1]):
+            at[0] = delay[pixel, i]
+            log[pixel, i] = _log_density(
+                at, start, n_pulses > 0, fired, unfired, sums, echo, first_tap, shape, node
+            )

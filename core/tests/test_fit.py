@@ -118,6 +118,32 @@ def test_warnings_are_rare_where_the_model_holds() -> None:
     assert fits.count(False) <= stats.binom.isf(RARE, len(fits), SIGNIFICANCE)
 
 
+def facing_wall(phase: float, pulse: Pulse, assumed: Pulse, seed: int = 0) -> Capture:
+    """Capture whose echoes all have the same delay; the pulse may be taken for another."""
+    onset, signal = np.full((SIZE, SIZE), 40 + phase), np.full((SIZE, SIZE), 0.1041)
+    rate = rate_per_bin(onset, signal, 0.1041, pulse, ACQUISITION)
+    counts = draw_counts(rate, 1000, np.random.default_rng(seed))
+    return Capture(counts, ACQUISITION, assumed)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("width_bins", [0.35, 1.0])
+def test_warnings_are_rare_where_all_delays_are_at_the_same_phase_of_a_bin(
+    width_bins: float,
+) -> None:
+    pulse = Pulse(width_bins * ACQUISITION.bin_width_s)
+    captures = [facing_wall(phase, pulse, pulse, i) for phase in (0.0, 0.5) for i in range(4)]
+    fits = [fit_of(capture).fits for capture in captures]
+    assert fits.count(False) <= stats.binom.isf(RARE, len(fits), SIGNIFICANCE)
+
+
+@pytest.mark.compiled
+def test_another_pulse_does_not_pass_for_delays_at_few_phases() -> None:
+    assumed, longer = (Pulse(each * ACQUISITION.bin_width_s) for each in (0.35, 0.45))
+    found = fit_of(facing_wall(0.0, longer, assumed))
+    assert found.pulse in found.failed
+
+
 @pytest.mark.compiled
 def test_p_values_depend_on_the_pixel_alone() -> None:
     capture = drawn()
