@@ -429,7 +429,7 @@ class _Mixture:
         rows, near = [], None
         for each in log_background:
             fit, top = self._fit(each, signal, of_target)
-            found, near = _largest(fit, least, near)
+            found, near = largest_fit(fit, least, near)
             rows.append(found + top)
         return np.stack(rows)
 
@@ -483,7 +483,8 @@ _STEPS = 6.0, 1.2  # delays per width of an echo, its middle 80 %; and per root 
 _TRIAL = 0.5  # as many to choose a pulse
 _MOST_STEPS = 16  # delays per bin
 _SHAPES = (0.3, 3000.0)  # of gamma distributions, from mostly faint pixels to equal ones
-_TRIED, _ZOOMS, _ZOOMS_NEAR = 5, 7, 3  # zooms, and those saved near the maximum
+_FIRST_TRIED = 17  # shares and shapes; of fewer, a broad local maximum may seem the largest
+_TRIED, _ZOOMS = 5, 4  # near the maximum
 
 
 def _own_weight(capture: Capture, known: FluxPrior) -> float:
@@ -508,7 +509,7 @@ def _lagrange(nodes: Floats, x: float) -> Floats:
     return np.asarray((off / apart).prod(axis=1))
 
 
-def _largest(fit: _Fit, least_share: Floats, near: Floats | None) -> tuple[Floats, Floats]:
+def largest_fit(fit: _Fit, least_share: Floats, near: Floats | None) -> tuple[Floats, Floats]:
     """Maximise a function over share and shape for each signal.
 
     Parameters
@@ -525,22 +526,23 @@ def _largest(fit: _Fit, least_share: Floats, near: Floats | None) -> tuple[Float
     place : ndarray, shape (2, signal)
         Square root of the share, and logarithm of the shape.
     """
-    every, steps = np.arange(least_share.size), np.linspace(0.0, 1.0, _TRIED)
+    every = np.arange(least_share.size)
     lowest = np.stack([np.sqrt(least_share), np.full(every.size, math.log(_SHAPES[0]))])
     highest = np.stack([np.ones(every.size), np.full(every.size, math.log(_SHAPES[1]))])
-    low, high, best, zooms = lowest, highest, np.full(every.size, -np.inf), _ZOOMS
-    if near is not None:
-        half = (highest - lowest) / 2 ** (_ZOOMS_NEAR + 1)
-        low, high = np.maximum(near - half, lowest), np.minimum(near + half, highest)
-        zooms -= _ZOOMS_NEAR
-    for _ in range(zooms):
+    low, high, best, tried = lowest, highest, np.full(every.size, -np.inf), (_TRIED,) * _ZOOMS
+    if near is None:
+        tried = (_FIRST_TRIED, *tried)
+    else:
+        spacing = (highest - lowest) / (_FIRST_TRIED - 1)
+        low, high = np.maximum(near - spacing, lowest), np.minimum(near + spacing, highest)
+    for n in tried:
+        steps, spacing = np.linspace(0.0, 1.0, n), (high - low) / (n - 1)
         root, log = low[..., np.newaxis] + (high - low)[..., np.newaxis] * steps
         found = fit((root**2)[:, :, np.newaxis], np.exp(log)[:, np.newaxis, :])
         flat = found.reshape(every.size, -1)
         at, best = flat.argmax(axis=1), np.maximum(best, flat.max(axis=1))
-        centre = np.stack([root[every, at // _TRIED], log[every, at % _TRIED]])
-        quarter = (high - low) / 4
-        low, high = np.maximum(centre - quarter, lowest), np.minimum(centre + quarter, highest)
+        centre = np.stack([root[every, at // n], log[every, at % n]])
+        low, high = np.maximum(centre - spacing, lowest), np.minimum(centre + spacing, highest)
     return best, centre
 
 

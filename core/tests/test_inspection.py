@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.special import logsumexp
+from scipy.stats import nbinom
 
 import core
 from core import inspection
@@ -26,7 +27,7 @@ from core.inference.faults import outlier_pixels, pixel_verdict, probability_of_
 from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.maps import likeliest
-from core.inspection.mean_flux import mean_flux_of
+from core.inspection.mean_flux import largest_fit, mean_flux_of
 from core.inspection.profile import Box as Bounds
 from core.inspection.profile import difference_of, ratio_of, zoomed
 from core.metrics import Interval, restored
@@ -386,6 +387,26 @@ def test_mean_fluxes_in_strong_sun_are_right(reflectivity: tuple[float, float]) 
         mean = factor.mean()
         assert found.image.signal.value == pytest.approx(signal * mean, rel=0.1)
         assert found.image.background.value == pytest.approx(background * mean, rel=0.02)
+
+
+@pytest.mark.parametrize("photons", [2.0, 4.0, 6.0, 10.0])
+def test_the_largest_likelihood_of_a_few_bright_pixels_is_found(photons: float) -> None:
+    """Many faint pixels of which hardly any shows a photon are a local maximum."""
+    rng, n_pixels = np.random.default_rng(0), 1000
+    counts = np.where(rng.random(n_pixels) < 0.03, rng.poisson(photons, n_pixels), 0)
+    signal = counts.mean() * np.array([0.8, 0.9, 1.0, 1.1])[:, np.newaxis, np.newaxis]
+
+    def fit(share: Floats, shape: Floats) -> Floats:
+        log = np.zeros(np.broadcast_shapes(signal.shape, share.shape, shape.shape))
+        for value, times in zip(*np.unique(counts, return_counts=True), strict=True):
+            seen = share * nbinom.pmf(value, shape, shape / (shape + signal / share))
+            log += times * np.log(np.maximum(seen + (1 - share) * (value == 0), 1e-300))
+        return log
+
+    found, _ = largest_fit(fit, np.full(signal.size, 1e-6), None)
+    share = np.linspace(0.02, 1.0, 120)[:, np.newaxis] ** 2
+    largest = fit(share, np.geomspace(0.3, 3000, 40)).max(axis=(1, 2))
+    assert (found > largest - 0.5).all()
 
 
 @pytest.mark.parametrize("method", ["tracking", "likelihood", "coates"])
