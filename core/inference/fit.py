@@ -53,6 +53,7 @@ GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
 FEWEST = 5.0  # expected counts of a group, for a normal sum
 _STEPS_PER_BIN = 128  # delays at which an echo is tabulated
 _PHASES = 64  # of delays in a bin
+_COARSE_PHASES = 16
 _DELAY_COST = 20  # counts that other kernels process in the time of one delay
 _SEED = np.uint64(0)
 
@@ -270,7 +271,11 @@ def _drawn(
     streams: NDArray[np.intp],
 ) -> tuple[Floats, Floats, Floats]:
     """Draw delay (NaN for no echo), signal, and background per bin of pixels, (pixel,) each."""
-    given, state = _drawn_at_any_phase(capture, pixels, cube, streams)
+    if np.array_equal(pixels, _sample(capture)) and np.array_equal(pixels, streams):
+        given, drawn = _drawn_of_sample(capture)
+    else:
+        given, drawn = _drawn_at_any_phase(capture, pixels, cube, streams)
+    state = drawn.copy()
     if (shares := _phase_shares(capture)) is not None:
         delay, log = _delay_logs(given, state)
         density = np.exp(log - log.max(axis=1, keepdims=True)) * np.resize(shares, log.shape[1])
@@ -281,16 +286,27 @@ def _drawn(
 
 
 @cached_per_capture
+def _drawn_of_sample(capture: Capture) -> tuple[tuple[Any, ...], Floats]:
+    """Draw delays, signals and backgrounds of the pixels of `fit_of` as `_drawn_at_any_phase`."""
+    pixels = _sample(capture)
+    cube = capture.cube.reshape(-1, capture.acquisition.n_bins)[pixels]
+    return _drawn_at_any_phase(capture, pixels, cube, pixels)
+
+
+@cached_per_capture
 def _phase_shares(capture: Capture) -> Floats | None:
     """Estimate how often delays are at each phase of a bin, shape (phase,).
 
-    None if any phase is as likely: the gain in log likelihood does not exceed the number of phases
-    (Akaike 1974).
+    None if any phase is as likely: drawn delays do not contradict that, or the gain in log
+    likelihood does not exceed the number of phases (Akaike 1974).
     """
-    pixels = _sample(capture)
-    cube = capture.cube.reshape(-1, capture.acquisition.n_bins)[pixels]
-    log = _delay_logs(*_drawn_at_any_phase(capture, pixels, cube, pixels))[1]
-    density = np.exp(log - log.max(axis=1, keepdims=True)).reshape(pixels.size, -1, _PHASES)
+    given, state = _drawn_of_sample(capture)
+    drawn = np.histogram(state[:, 0] % 1, _COARSE_PHASES, (0.0, 1.0))[0]
+    squares = ((drawn - drawn.mean()) ** 2).sum() / max(drawn.mean(), 1.0)
+    if scipy.special.chdtrc(_COARSE_PHASES - 1, squares) > SIGNIFICANCE:
+        return None
+    log = _delay_logs(given, state)[1]
+    density = np.exp(log - log.max(axis=1, keepdims=True)).reshape(len(log), -1, _PHASES)
     at_phase = density.sum(axis=1)
     at_any = at_phase.mean(axis=1, keepdims=True)
     likelihood = np.hstack([at_any, at_phase]) / at_any
