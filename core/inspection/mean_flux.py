@@ -13,7 +13,9 @@ The maximum-likelihood gamma distribution has the mean of the observed signals, 
 true distribution, so that the model need not be exact where signals are clear.
 
 Target pixels are those with an echo: the same likelihood, as a function of their mean signal
-instead of that of all pixels.
+instead of that of all pixels. How many there are does depend on the distribution: beside a few
+retroreflectors, most pixels seem to have no echo. If signal levels with shares of their own are
+clearly likelier, the interval includes what they give, too.
 
 The intervals are for the means of the pixels of the capture that are neither hot nor dead, and
 include the chance by which a sample differs from the image. They hold for the fitted pulse: the
@@ -43,6 +45,7 @@ from core.inference.flux import (
     background_in_strong_sun,
     detailed_flux_prior_of,
     level_likelihoods,
+    level_shares,
     total_rates,
 )
 from core.inference.flux_model import FluxPrior
@@ -63,6 +66,7 @@ _Fit = Callable[[Floats, Floats], Floats]
 
 _SIGMAS = float(scipy.special.ndtri(0.5 + LEVEL / 2))
 _SAMPLE = 512  # pixels
+_CLEARLY_LIKELIER = 10.0  # log likelihood of levels of signal, above that of a gamma distribution
 _FEW = 24  # pixels, too few to estimate the scatter of the signals
 _DARK = 30  # photons in all, too few to separate signal and background
 _BRIGHT = 400  # photons of the brightest echo, enough for the mean
@@ -338,7 +342,7 @@ class _Mixture:
         box, self.image = self._estimated(box, of_target=False)
         bright = min(math.sqrt(bright), box.most[1] / 2)
         box = box._replace(low=(box.low[0], 0.8 * bright), high=(box.high[0], 1.2 * bright))
-        self.target = self._estimated(box, of_target=True)[1]
+        self.target = self._with_any_distribution(self._estimated(box, of_target=True)[1])
 
     @property
     def has_own_backgrounds(self) -> bool:
@@ -371,6 +375,33 @@ class _Mixture:
             return signal, background
 
         return box, spans(box, surface(*box.grid(_FINE)), flux_at)
+
+    def _with_any_distribution(self, target: FluxEstimate) -> FluxEstimate:
+        """Return fluxes of target pixels that hold where signals are not gamma distributed.
+
+        If another distribution of the signals is clearly likelier, the value is that of its target
+        pixels, and the interval includes both.
+        """
+        n_pixels, most = self._sample.shape[1], target.signal.value
+        background = max(self.image.background.value, math.exp(self._nodes[0]))
+        log_background = float(np.clip(math.log(background), *self._nodes[[0, -1]]))
+        gamma = self._log_likelihood(np.array([log_background]), np.array([most]), True)[0, 0]
+        log = np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1)
+        top = log.max(axis=1, keepdims=True)
+        likelihood = np.exp(log - top)
+        share = level_shares(likelihood)
+        if float(np.log(likelihood @ share).sum() + top.sum()) < gamma + _CLEARLY_LIKELIER:
+            return target
+        mean, image = float(share @ self._levels), self.image.signal
+        variance = float(share @ (self._levels - mean) ** 2) / n_pixels
+        chance = math.hypot(
+            (image.high - image.low) / 2 / image.value, _SIGMAS * math.sqrt(variance) / mean
+        )
+        signal = mean / (1 - float(share[0]))
+        ends = Interval(signal, signal * max(1 - chance, 0.0), signal * (1 + chance))
+        found = ends.joined(target.signal)
+        sbr = ratio_of(found, self.image.background)
+        return FluxEstimate(found, target.background, sbr)
 
     def _sharpened(self, pulse: Pulse, log_background: float) -> FluxPrior:
         """Return the prior with the power of its distribution of delays that is likeliest.

@@ -467,6 +467,23 @@ def test_a_bright_surface_in_one_pixel_is_not_hot(n_pulses: int | None) -> None:
 
 
 @pytest.mark.compiled
+@pytest.mark.parametrize("faint", [0.02, 0.03])
+def test_a_few_bright_pixels_do_not_hide_that_all_have_an_echo(faint: float) -> None:
+    """No gamma distribution has such signals, the likeliest takes faint pixels for empty ones."""
+    acquisition, pulse = Acquisition(n_bins=200, n_pulses=500), Pulse.gaussian(1.5e-9)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        onset, signal = rng.uniform(40, 42, (32, 32)), np.full((32, 32), faint)
+        signal[rng.random(signal.shape) < 0.05] = 4.0
+        rate = rate_per_bin(onset, signal, 0.5, pulse, acquisition)
+        counts = draw_counts(rate, acquisition.n_pulses, rng)
+        found = mean_flux_of(Capture(counts, acquisition, pulse)).target
+        assert found.signal.low < signal.mean() < found.signal.high
+        assert found.sbr.low < signal.mean() / 0.5 < found.sbr.high
+        assert found.signal.value < 2 * signal.mean()
+
+
+@pytest.mark.compiled
 @pytest.mark.parametrize("seed", range(4))
 def test_surfaces_of_uneven_reflectivity_in_the_sun_are_neither_hot_nor_dead(seed: int) -> None:
     """Their signal and their background are in proportion to it."""
