@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 
-from core.acquisition import Acquisition, Flux
+from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, Detection
 from core.effects import Motion
 from core.estimators import ESTIMATORS, RangeImage, estimate
@@ -67,6 +67,7 @@ def warm_up(
             _use_neighbours,
             partial(_thin_and_map, small),
             lambda: fit_of(small()),
+            lambda: fit_of(_at_an_edge()),
             *(partial(estimated, method, large) for method in ESTIMATORS),
             partial(estimated, "peak", large, returns=2),
             lambda: fit_of(large()),
@@ -83,6 +84,14 @@ def _with_large_counts(capture: Capture) -> Capture:
     n_pulses = _LARGE * (capture.acquisition.n_pulses or 1)
     acquisition = replace(capture.acquisition, n_pulses=n_pulses)
     return replace(capture, cube=np.uint32(_LARGE) * capture.cube, acquisition=acquisition)
+
+
+def _at_an_edge() -> Capture:
+    """Capture of short echoes all at the edge of a bin, which the fit learns."""
+    acquisition = Acquisition(n_pulses=1000)
+    scene = Scene(np.full((8, 8), acquisition.bin_to_range_m(40.0)), acquisition=acquisition)
+    pulse = Pulse(acquisition.bin_width_s / 3)
+    return simulate(scene, acquisition, Flux(sbr=1.0), pulse)
 
 
 def _thin_and_map(capture: Callable[[], Capture]) -> None:

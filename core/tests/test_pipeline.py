@@ -87,6 +87,9 @@ if only is None:
     core.reductions.share_of_pulses(flat, 0.5)
     for each in core.inspection.maps.values():
         each(flat)
+    beside = core.Scene(np.full((12, 12), scene.acquisition.bin_to_range_m(30.0)))
+    short = core.Pulse(0.4 * scene.acquisition.bin_width_s)
+    core.inference.fit_of(core.simulate(beside, scene.acquisition, core.Flux(sbr=2.0), short))
     # Counts beyond uint16.
     bright = core.Capture(np.uint32(2**17) * flat.cube, scene.acquisition, detection="all")
     for method in set(core.ESTIMATORS) - {"oracle"}:
