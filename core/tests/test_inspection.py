@@ -444,6 +444,16 @@ def test_pixels_of_a_dead_column_are_dead_but_not_those_of_a_night_sky() -> None
     assert inspection.capture_report(replace(night, cube=sky)).n_dead == 0
 
 
+def test_a_pixel_with_few_counts_is_only_dead_if_it_has_hardly_any() -> None:
+    counts = np.full((5, 5, 10), 40, np.uint16)
+    counts[1, 1], counts[3, 3] = 12, 1
+    capture = Capture(counts, Acquisition(10, n_pulses=100_000))
+    verdict = pixel_verdict(capture, 1, 1)
+    assert verdict.health == "cannot tell" and "less sensitive" in verdict.why
+    assert pixel_verdict(capture, 3, 3).health == "dead"
+    assert [each[:3] for each in inspection.faulty_pixels(capture)] == [(3, 3, "dead")]
+
+
 def test_a_pixel_may_miss_pulses_that_its_neighbours_do_not() -> None:
     assert probability_of_fewer(398, 400, 400) > 0.1
     assert probability_of_fewer(200, 400, 400) < 1e-100
