@@ -286,7 +286,7 @@ def _estimated(
 
 def _completed(capture: Capture, found: FluxPrior, share: Floats) -> tuple[FluxPrior, _Shapes]:
     """Return `_flux_prior`, given the shares of the coarse grid of levels that `found` has."""
-    (total, has_signal, _), _, spent = _totals(capture)
+    (total, has_signal, _), *_ = _totals(capture)
     signal_share = float(has_signal.mean())
     mean = signal_share * (share @ found.levels)
     levels, share, pair = _halved(found.levels, share, _kept(share))
@@ -305,7 +305,7 @@ def _completed(capture: Capture, found: FluxPrior, share: Floats) -> tuple[FluxP
     kept = _kept(share)
     levels, share = levels[kept], share[kept] / share[kept].sum()
     background = float(total.mean() - signal_share * (share @ levels))
-    is_biased = spent > _MANY_SPENT and found.own_weight == 0
+    is_biased = has_many_spent(capture) and found.own_weight == 0
     if is_biased and math.isfinite(free.mean):
         background = free.mean
     elif background < share @ levels and free.mean < total.mean():
@@ -408,6 +408,11 @@ def _sampled(n_pixels: int, most: int) -> NDArray[np.intp]:
 def total_rates(capture: Capture) -> Floats:
     """Estimate the sum of signal and background of each pixel, shape (row, col)."""
     return _totals(capture).of.rate
+
+
+def has_many_spent(capture: Capture) -> bool:
+    """Return whether nearly all pulses fire in so many pixels that the mean total is biased."""
+    return _totals(capture).spent > _MANY_SPENT
 
 
 def background_in_strong_sun(capture: Capture) -> tuple[float, float] | None:

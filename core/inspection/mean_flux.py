@@ -44,6 +44,7 @@ from core.inference.flux import (
     SAMPLE,
     background_in_strong_sun,
     detailed_flux_prior_of,
+    has_many_spent,
     level_likelihoods,
     level_shares,
     total_rates,
@@ -150,7 +151,8 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     some, share = _dimmer(ordinary)
     mixture, scale = _Mixture(some), 1.0 if acquisition.n_pulses else 1 / share
     model, target = (each.of(some).scaled(scale) for each in (mixture.image, mixture.target))
-    total = total_flux(ordinary)
+    # Few unfired pulses show too small a total.
+    total = None if has_many_spent(ordinary) else total_flux(ordinary)
     known = background_in_strong_sun(ordinary)
     if mixture.has_own_backgrounds and known is not None:
         mean, half = known[0], _SIGMAS * known[1]

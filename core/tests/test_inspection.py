@@ -494,6 +494,19 @@ def test_a_few_bright_pixels_do_not_hide_that_all_have_an_echo(faint: float) -> 
 
 
 @pytest.mark.compiled
+def test_pixels_that_fire_nearly_all_pulses_do_not_lower_the_mean_signal() -> None:
+    acquisition, pulse = Acquisition(n_bins=200, n_pulses=50), Pulse.gaussian(1.5e-9)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        onset, signal = rng.uniform(40, 42, (32, 32)), np.full((32, 32), 0.5)
+        signal[rng.random(signal.shape) < 0.3] = 4.0
+        rate = rate_per_bin(onset, signal, 0.3, pulse, acquisition)
+        counts = draw_counts(rate, acquisition.n_pulses, rng)
+        found = inspection.estimate_mean_flux(Capture(counts, acquisition, pulse))
+        assert found.signal.low < signal.mean() < found.signal.high
+
+
+@pytest.mark.compiled
 @pytest.mark.parametrize("seed", range(4))
 def test_surfaces_of_uneven_reflectivity_in_the_sun_are_neither_hot_nor_dead(seed: int) -> None:
     """Their signal and their background are in proportion to it."""
