@@ -5,7 +5,9 @@ from __future__ import annotations
 import gc
 import re
 import tempfile
+from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -135,8 +137,18 @@ def test_a_file_that_could_be_read_is_kept_when_other_options_are_refused(folder
 
 
 def test_an_estimate_that_arrives_after_an_upload_does_not_open_inspect():
-    layout = HeldLayout(built_in_sources(), uploads=Uploads())
+    sources, has_begun = built_in_sources(), Event()
+
+    def load(request):
+        has_begun.set()
+        return wall.load(request)
+
+    wall = sources["wall"]
+    layout = HeldLayout(sources | {"wall": replace(wall, load=load)}, uploads=Uploads())
     control(layout, "Scene or capture").value = "wall"
+    while not has_begun.wait(0.1):  # else the upload would replace it
+        if not layout.tasks.waiting.empty():
+            layout.tasks.run_one()
     button = control(layout, "Open a capture file")
     button.param.update(filename=["notes.txt"], value=[b"nothing of the kind"])
     layout.tasks.run_until(lambda: layout.session.estimate.refused)
