@@ -384,18 +384,20 @@ class _Mixture:
         If another distribution of the signals is clearly likelier, the value is that of its target
         pixels, and the interval includes both.
         """
-        n_pixels, most = self._sample.shape[1], target.signal.value
+        image = self.image.signal
         background = max(self.image.background.value, math.exp(self._nodes[0]))
         log_background = float(np.clip(math.log(background), *self._nodes[[0, -1]]))
-        gamma = self._log_likelihood(np.array([log_background]), np.array([most]), True)[0, 0]
-        log = np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1)
+        at = np.array([log_background]), np.array([target.signal.value])
+        gamma = self._log_likelihood(*at, of_target=True)[0, 0]
+        log = self._logs_at(log_background)
         top = log.max(axis=1, keepdims=True)
         likelihood = np.exp(log - top)
         share = level_shares(likelihood)
-        if float(np.log(likelihood @ share).sum() + top.sum()) < gamma + _CLEARLY_LIKELIER:
+        free = float(np.log(likelihood @ share).sum() + top.sum())
+        if free < gamma + _CLEARLY_LIKELIER or image.value == 0:
             return target
-        mean, image = float(share @ self._levels), self.image.signal
-        variance = float(share @ (self._levels - mean) ** 2) / n_pixels
+        mean = float(share @ self._levels)
+        variance = float(share @ (self._levels - mean) ** 2) / self._sample.shape[1]
         chance = math.hypot(
             (image.high - image.low) / 2 / image.value, _SIGMAS * math.sqrt(variance) / mean
         )
@@ -466,9 +468,13 @@ class _Mixture:
             rows.append(found + top)
         return np.stack(rows)
 
+    def _logs_at(self, log_background: float) -> Floats:
+        """Interpolate the log likelihoods of the levels, shape (pixel, level)."""
+        return np.asarray(np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1))
+
     def _fit(self, log_background: float, signal: Floats, of_target: bool) -> tuple[_Fit, float]:
         """Return the log likelihood of shares and shapes for each signal, above a constant."""
-        log = np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1)
+        log = self._logs_at(log_background)
         top = log.max(axis=1, keepdims=True)
         # A few pixels at a time: larger products start threads, which take longer.
         parts = np.array_split(
