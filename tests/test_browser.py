@@ -818,7 +818,10 @@ def test_a_phone_shows_everything_stacked(page):
         assert len(colors(pixels(part.screenshot()))) > 20
     new.get_by_role("button", name="Open drawer").click()
     expect(slider(new, "SBR")).to_be_in_viewport()
+    sidebar = new.locator(".MuiDrawer-modal")
+    expect(sidebar.locator(":focus")).to_be_attached()
     new.keyboard.press("Escape")
+    expect(sidebar).to_have_count(0)
     new.get_by_role("button", name=re.compile("^Tour")).press("Enter")
     expect(new.get_by_role("button", name="Next", exact=True)).to_be_focused()
     take_the_tour(new)
