@@ -29,6 +29,7 @@ from core.io.readers import MAX_CUBE_BYTES, SUFFIXES, guards, open_capture, read
 from core.io.readers.labelled import describe
 from core.io.writers import save_capture
 from core.tests.formats import FORMATS, Format, damaged, put
+from core.tests.labelled_files import hdf5_bytes
 from core.tests.refusing import assert_refused, count_refused, with_peak
 from core.tests.samples import (
     ACQUISITION,
@@ -423,6 +424,25 @@ def test_gates_of_too_many_bins_are_refused(
 ) -> None:
     path = write("g.mat", cell_bytes([10**8, 1]))
     assert_refused(lambda path: read_capture(path, **options), path, message, CaptureError, 2**22)
+
+
+def test_bins_come_first_if_only_the_other_axes_are_as_long(write: Write, tmp_path: Path) -> None:
+    cube = np.arange(10 * 4 * 4).reshape(10, 4, 4)
+    files = (
+        write("f.npy", npy_bytes(cube)),
+        write("f.npz", npz_bytes(counts=cube)),
+        write("f.mat", mat_bytes(counts=cube)),
+        put(tmp_path / "f.h5", hdf5_bytes(counts=cube)),
+    )
+    for path in files:
+        capture = read_capture(path)
+        np.testing.assert_array_equal(capture.cube, cube.transpose(1, 2, 0))
+        assert "guessed: axes (bin, row, col)" in capture.source
+        assert capture.guesses["axes"] == "bin row col"
+        np.testing.assert_array_equal(read_capture(path, axes="row col bin").cube, cube)
+    np.testing.assert_array_equal(open_capture(files[-1]), cube.transpose(1, 2, 0))
+    for shape in ((4, 4, 4), (10, 4, 5), (10, 10, 4), (7, 4, 4), (1, 4, 4)):
+        assert read_capture(write("g.npy", npy_bytes(np.ones(shape, int)))).cube.shape == shape
 
 
 def test_axes_are_turned(write: Write) -> None:

@@ -1,8 +1,8 @@
 """Histogram cubes of any number type, and the description of counts.
 
-By default the axes are (row, col, bin), bins are 1 ns wide, the gate opens with the pulse, and
-`core.io.readers.pulse_guess` estimates the echo from the counts. A common-stop instrument's bins
-(``stop_s``) are reversed.
+By default the axes are in the order of `guess_axes`, bins are 1 ns wide, the gate opens with the
+pulse, and `core.io.readers.pulse_guess` estimates the echo from the counts. A common-stop
+instrument's bins (``stop_s``) are reversed.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 AXES = ("row", "col", "bin")
 LARGEST_COUNT = 2**32 - 1
+
+_FEWEST_BINS = 8  # of a cube whose bins come first
 
 Counts = NDArray[np.unsignedinteger]
 
@@ -143,13 +145,23 @@ def cube_capture(
     **more
         As `dense_capture` takes them.
     """
-    order = replace(request, axes=request.axes or axes).order(AXES)
-    if order is not None:
-        require_cube(cube, name)
-        cube = cube.transpose(order)
-    guessed = [*([] if order else [f"axes ({', '.join(AXES)})"]), *guessed]
+    require_cube(cube, name)
+    found = guess_axes(cube.shape)
+    is_guessed = (request.axes or axes) is None
+    order = replace(request, axes=request.axes or axes or " ".join(found)).order(AXES)
+    cube = cube.transpose(order)
+    guessed = [*([f"axes ({', '.join(found)})"] if is_guessed else []), *guessed]
     capture = dense_capture(whole_counts(cube, name), origin, request, guessed=guessed, **more)
-    return capture if order else with_guesses(capture, axes=" ".join(AXES))
+    return with_guesses(capture, axes=" ".join(found)) if is_guessed else capture
+
+
+def guess_axes(shape: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the likely order of a cube's axes: bins last, or first if the other two are as long.
+
+    Images are often square, while a row rarely has as many pixels as a pixel has bins.
+    """
+    is_first = shape[1] == shape[2] != shape[0] >= _FEWEST_BINS
+    return ("bin", "row", "col") if is_first else AXES
 
 
 def dense_capture(

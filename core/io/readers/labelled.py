@@ -7,7 +7,7 @@ stands in the attributes of the counts, under the names and with the meaning of
 
 Arrays of others open too. Their axes are known by the names below, or by ``axes``; bins by any
 coordinate along them whose ``units`` are a time's or metres, or whose name ends in such a unit.
-Where a file names no axes, as plain HDF5 does not, they are guessed to be (row, col, bin).
+Where a file names no axes, as plain HDF5 does not, `core.io.readers.dense.guess_axes` does.
 
 Unsigned counts of 8, 16 or 32 bits keep their type. Others are checked when they are read, and are
 uint16 or uint32 in a capture, uint32 in an array that is opened but not read.
@@ -32,6 +32,7 @@ from core.io.readers.dense import (
     Description,
     capture_of,
     description_of,
+    guess_axes,
     require_sums,
     stored_counts,
     whole_counts,
@@ -158,20 +159,19 @@ class _File:
         missing = {name: value for name in _MISSING if (value := number(known, name)) is not None}
         self.counts = CheckedCounts(chosen, missing)
         is_nameless = not any(chosen.axes) and request.axes is None
-        self.guessed = [f"axes ({', '.join(AXES)})"] if is_nameless else []
         axes = chosen.axes or (None,) * n_axes
-        self._dims = (
-            AXES if is_nameless else tuple(name or f"axis_{k}" for k, name in enumerate(axes))
-        )
-        distinct = len({*self._dims}) == len(self._dims)
-        require(f"axes of {chosen.name}", self._dims, distinct, "each name once")
-        self.places = _places(self._dims, request, chosen.name)
+        named = tuple(name or f"axis_{k}" for k, name in enumerate(axes))
+        self.dims = guess_axes(chosen.shape) if is_nameless else named
+        self.guessed = [f"axes ({', '.join(self.dims)})"] if is_nameless else []
+        distinct = len({*self.dims}) == len(self.dims)
+        require(f"axes of {chosen.name}", self.dims, distinct, "each name once")
+        self.places = _places(self.dims, request, chosen.name)
 
     def labelled(self, data: Any) -> xr.DataArray:
         """Return counts (row, col, bin) with the coordinates and attributes of the file."""
         import xarray as xr  # noqa: PLC0415
 
-        sizes = dict(zip(self._dims, data.shape, strict=True))
+        sizes = dict(zip(self.dims, data.shape, strict=True))
         along = [
             one
             for one in self._arrays
@@ -189,7 +189,7 @@ class _File:
         found = xr.DataArray(
             data,
             coords=xr.Coordinates(coordinates, indexes={}),
-            dims=self._dims,
+            dims=self.dims,
             name=self._name,
             attrs={name: value for name, value in known.items() if name not in _ENCODING},
         )
@@ -198,7 +198,7 @@ class _File:
     def image(self, name: str) -> Floats | None:
         """Read an image (row, col) that accompanies counts of our own layout, if there is one."""
         prefix = self._chosen.name.removesuffix("counts")
-        row, col = (self._dims[k] for k in self.places[:2])
+        row, col = (self.dims[k] for k in self.places[:2])
         shape = self.counts.shape[self.places[0]], self.counts.shape[self.places[1]]
         for one in self._arrays if self._name == "counts" else ():
             if one.name == prefix + name and len(one.shape) == 2:
@@ -223,7 +223,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
     counts = file.labelled(cube)
     require_sums(counts.shape)
     known = describe(counts, request, file.origin, file.guessed)
-    name, axes = file.counts.stored.name, {"axes": " ".join(AXES)} if file.guessed else {}
+    name, axes = file.counts.stored.name, {"axes": " ".join(file.dims)} if file.guessed else {}
     is_own = name.rpartition("/")[2] == "counts"
     capture = capture_of(np.ascontiguousarray(counts.data), known)
     capture = with_guesses(capture, variable=name, **axes)

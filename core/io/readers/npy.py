@@ -1,4 +1,4 @@
-"""NumPy ``.npy``: one histogram cube (row, col, bin) of non-negative whole numbers.
+"""NumPy ``.npy``: one histogram cube of non-negative whole numbers, in any order of its axes.
 
 If ``no_trigger`` is given, the array holds raw frames (pulse, row, col), see
 `core.io.readers.frames`. An array that looks like such is refused without it; ``axes`` declares it
