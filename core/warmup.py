@@ -58,7 +58,6 @@ def warm_up(
         lambda: tracking_signals(small().cube, PRESETS["recommended"]),
         lambda: flux_model_of(small()),
         *(partial(estimated, method) for method in ([only] if only else ESTIMATORS)),
-        # `scipy.signal` takes a second to import.
         lambda: pixel_report(small(), estimated(only or "tracking"), 0, 0),
     ]
     if only is None:

@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
@@ -19,6 +18,7 @@ from core.checks import require_pixel
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.estimators.base import Evidence
+from core.estimators.shi import prominences
 from core.inference.background import echo_window
 from core.inference.faults import PixelVerdict, pixel_verdict
 from core.inference.fit import Fit, fit_of
@@ -310,7 +310,7 @@ def _candidates(
     Candidates are maxima of `curve`; their probabilities are by `judge`, or by the pixel alone.
     """
     estimate_bin, confidence = float(image.bin[row, col]), float(image.confidence[row, col])
-    peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
+    peaks = np.flatnonzero(prominences(np.pad(curve, 1, constant_values=-np.inf))) - 1
     # A signal far below the image's mean makes all scores of the likelihood negative.
     base = 0.0 if curve.max() > 0 else float(np.median(curve))
     peaks = peaks[curve[peaks] > base]

@@ -66,7 +66,7 @@ def changed(
     steps = np.arange(math.ceil((end_s - begin_s) / resolution_s) + 1)
     prompt = np.diff(core.cdf(begin_s + steps * resolution_s))
     delay = np.exp(-steps[:-1] * resolution_s / tail_s)
-    late = scipy.signal.fftconvolve(prompt, delay / delay.sum())[: prompt.size]
+    late = np.convolve(prompt, delay / delay.sum())[: prompt.size]
     return Pulse.measured(np.maximum((1 - share) * prompt + share * late, 0.0), resolution_s)
 
 
