@@ -75,21 +75,25 @@ READY = ".stage[data-camera], [aria-label='Pinned pixels']"
 
 
 @contextmanager
-def chromium() -> Iterator[Browser]:
+def chromium(*, is_still: bool = False) -> Iterator[Browser]:
     """Start a browser without a window; raise where there is none."""
-    with sync_playwright() as playwright, launched(playwright.chromium) as browser:
+    with sync_playwright() as playwright, launched(playwright.chromium, is_still) as browser:
         yield browser
 
 
 @contextmanager
-def launched(kind: BrowserType) -> Iterator[Browser]:
+def launched(kind: BrowserType, is_still: bool) -> Iterator[Browser]:
     """Start a browser whose first context is that of `open_page`.
 
-    It has a folder of its own: in private contexts, each page would compile all scripts again.
+    It has a folder of its own: in private contexts, each page would compile all scripts again. If
+    `is_still`, it asks pages to reduce motion, which is half of its work.
     """
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         context = kind.launch_persistent_context(
-            folder, executable_path=browser_path(), args=ARGUMENTS
+            folder,
+            executable_path=browser_path(),
+            args=ARGUMENTS,
+            reduced_motion="reduce" if is_still else "no-preference",
         )
         context.set_default_timeout(TIMEOUT_MS)
         assert context.browser is not None

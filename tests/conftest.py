@@ -42,7 +42,7 @@ def address() -> Iterator[str]:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """One browser for all tests; without one the tests fail, they are never skipped."""
-    with chromium() as running:
+    with chromium(is_still=True) as running:
         yield running
 
 

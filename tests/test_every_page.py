@@ -133,7 +133,18 @@ def expect_the_sidebar_to_be_skipped(page: Page) -> None:
     expect(page.get_by_role("main").locator(":focus").first).to_be_attached()
 
 
+def expect_motion_only_where_it_is_wanted(page: Page) -> None:
+    duration = "(each) => parseFloat(getComputedStyle(each).transitionDuration)"
+    for name in ("Toggle theme", "Inspect"):  # in the template, and in a component of its own
+        moving = page.get_by_role("button", name=name, exact=True)
+        assert moving.evaluate(duration) < 1e-3
+        page.emulate_media(reduced_motion="no-preference")
+        assert moving.evaluate(duration) > 0.1
+        page.emulate_media(reduced_motion="reduce")
+
+
 def explore(page: Page) -> None:
+    expect_motion_only_where_it_is_wanted(page)
     expect_a_print_of_the_content(page)
     expect_a_steady_frame(page)
     show_scenes_in_every_way(page)

@@ -285,7 +285,7 @@ def recover(browser: Browser, page: Page) -> None:
 
 
 def test_a_page_recovers_from_the_loss_of_graphics_and_of_the_connection(browser, address):
-    with launched(browser.browser_type) as own:
+    with launched(browser.browser_type, is_still=True) as own:
         recover(own, open_page(own, address, prepare=CANVASES + CUT))
 
 

@@ -482,6 +482,7 @@ def fill_the_histogram(here: Page) -> None:
     expect(said).to_contain_text("Pulse 1 of 1,000")
     player.press("ArrowRight")
     expect(said).to_contain_text("Pulse 2 of 1,000")
+    here.emulate_media(reduced_motion="no-preference")
     player.press("Space")
     expect(said).to_contain_text(re.compile(r"Pulse \d{2,3} of"))
     player.press("Space")

@@ -67,12 +67,23 @@ TOOLTIP = {
     "defaultProps": {"disableInteractive": True},
     "styleOverrides": {"tooltip": {"width": "max-content", "maxWidth": "230px"}},
 }
+# In each component, for people whom motion distracts or makes ill.
+STILL = {
+    "@media (prefers-reduced-motion: reduce)": {
+        "*, *::before, *::after": {
+            "animationDuration": "0.01ms !important",
+            "animationIterationCount": "1 !important",
+            "transitionDuration": "0.01ms !important",
+        }
+    }
+}
 THEME = {
     mode: {
         "palette": {"primary": {"main": main}, "background": {"default": page, "paper": paper}},
         "typography": {"fontSize": 13},
         "components": {
             "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": bar, "color": "#ffffff"}}},
+            "MuiCssBaseline": {"styleOverrides": STILL},
             "MuiTooltip": TOOLTIP,
             "MuiToolbar": {
                 "styleOverrides": {
