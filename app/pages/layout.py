@@ -71,9 +71,8 @@ TOOLTIP = {
 STILL = {
     "@media (prefers-reduced-motion: reduce)": {
         "*, *::before, *::after": {
-            "animationDuration": "0.01ms !important",
-            "animationIterationCount": "1 !important",
-            "transitionDuration": "0.01ms !important",
+            "animation": "none !important",
+            "transition": "none !important",
         }
     }
 }
