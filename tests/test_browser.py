@@ -359,6 +359,14 @@ def move_sliders(page: Page) -> None:
     look_again(page, before)
 
 
+DOUBT = f"""(label) => {{
+  {VIEWS}
+  const {{ model }} = views.find(({{ model }}) => model.data?.label === label);
+  model.data.doubtful = [[0, 1, "As the server may find meanwhile."]];
+}}"""
+"""JavaScript that changes a slider as a message of the server does while a value is typed."""
+
+
 def type_values(page: Page) -> None:
     """Type values that are refused with a sentence, and others."""
     shown = fact(page, "RMSE").inner_text()
@@ -371,7 +379,9 @@ def type_values(page: Page) -> None:
     expect(refusal).to_be_hidden()
     settings = TrackingParameters(m=float(field(page, "m").input_value()))
     expect_rmse(page, car(Illumination(sbr=0.5), settings))
-    enter(page, "Pulses", "12.5")
+    field(page, "Pulses").fill("12.5")
+    page.evaluate(DOUBT, "Pulses")
+    field(page, "Pulses").press("Enter")  # what was typed is still there
     expect(page.get_by_text("“12.5” is not accepted: enter a whole number")).to_be_visible()
     field(page, "Pulses").press("Escape")
     expect(field(page, "Pulses")).to_have_value("1000")

@@ -56,6 +56,10 @@ export function render({ model }) {
     error.textContent = message;
     field.setAttribute("aria-invalid", message !== "");
   };
+  const write = () => {
+    field.value = text(model.value);
+    complain("");
+  };
   const show = () => {
     const { value, low, high, initial, parts, log, doubtful, substitute } = model;
     const effective = value ?? substitute;
@@ -66,7 +70,6 @@ export function render({ model }) {
     track.value = toPosition(effective);
     track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
     track.setAttribute("aria-valuetext", `${text(effective)} ${model.unit}`);
-    field.value = text(value);
     label.textContent = model.label;
     unit.textContent = model.unit && `(${model.unit})`;
     track.setAttribute("aria-label", `${model.label} ${unit.textContent}`.trim());
@@ -89,12 +92,12 @@ export function render({ model }) {
     reset.title = `Reset to ${initially}`;
     reset.setAttribute("aria-label", `Reset ${model.label} to ${initially}`);
     reset.style.visibility = value === initial ? "hidden" : "visible";
-    complain("");
   };
   const set = (value) => {
     window.firstphotonInput = performance.now(); // start of the response time, see facts.js
     model.value = value;
     show();
+    write();
   };
 
   track.setAttribute("aria-describedby", "help doubt");
@@ -118,15 +121,17 @@ export function render({ model }) {
       complain(`“${typed}” is not accepted: enter ${kind} from ${text(low)} to ${text(high)}.`);
     }
   });
-  field.addEventListener("keydown", ({ key }) => key === "Escape" && show());
+  field.addEventListener("keydown", ({ key }) => key === "Escape" && write());
   reset.addEventListener("click", () => set(model.initial));
   ask.addEventListener("click", () => {
     help.hidden = !help.hidden;
     ask.setAttribute("aria-expanded", String(!help.hidden));
   });
 
-  const shown = ["value", "low", "high", "initial", "label", "doubtful", "along"];
-  model.on([...shown, "empty", "substitute"], show);
+  const written = ["value", "low", "high", "along"]; // the others leave what is being typed
+  model.on([...written, "initial", "label", "doubtful", "empty", "substitute"], show);
+  model.on(written, write);
   show();
+  write();
   return root;
 }
