@@ -86,7 +86,7 @@ def launched(kind: BrowserType, is_still: bool) -> Iterator[Browser]:
     """Start a browser whose first context is that of `open_page`.
 
     It has a folder of its own: in private contexts, each page would compile all scripts again. If
-    `is_still`, it asks pages to reduce motion, which is half of its work.
+    `is_still`, it asks pages to reduce motion, so that it has less to draw.
     """
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         context = kind.launch_persistent_context(

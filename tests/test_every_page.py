@@ -176,7 +176,9 @@ def test_a_page_opens_first_has_plots_that_can_be_read_and_is_used(page, address
     if is_noted:
         expect_all_in_place(opened)
         expect_the_sidebar_to_be_skipped(opened)
+        opened.emulate_media(reduced_motion="no-preference")
         change_theme(opened)
+        opened.emulate_media(reduced_motion="reduce")
     expect_readable(opened, name)
     expect_a_print_that_states_its_link(opened)
     JOURNEYS[name](opened)

@@ -102,6 +102,7 @@ def test_frames_in_which_0_is_no_trigger_are_no_cube(
     with pytest.raises(CaptureError, match=given) as refused:
         read_capture(path)
     assert list(refused.value.choices) == ["Raw frames", "Counts"]
+    assert refused.value.choices["Counts"] == {"axes": "bin row col"}  # images are square
     capture = read_capture(path, no_trigger=0)
     assert capture.guesses["axes"] == "pulse row col"
     assert capture.acquisition.n_pulses == n_pulses

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import dense_capture, with_guesses
+from core.io.readers.dense import dense_capture, guess_axes, with_guesses
 from core.io.readers.frame_guess import resembles_frames
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.options import AmbiguousError, ReadOptions
@@ -197,8 +197,9 @@ def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
                 value, f"if {name} holds {frames}: {share:.0%} of its values are {value}"
             )
     if axes is None and least == 0 and resembles_frames(array):
-        counts = {"Counts": {"axes": "row col bin"}}
-        what = f"if {name} holds {frames}, as it seems, or axes = 'row col bin' if it holds counts"
+        order = " ".join(guess_axes(array.shape))
+        counts = {"Counts": {"axes": order}}
+        what = f"if {name} holds {frames}, as it seems, or axes = {order!r} if it holds counts"
         raise _are_frames(0, what, counts)
 
 
