@@ -14,6 +14,7 @@ from core.capture import Capture, Detection
 from core.effects import Motion
 from core.estimators import ESTIMATORS, RangeImage, estimate
 from core.inference import fit_of, flux_model_of
+from core.inference.faults import neighbour_median
 from core.inspection import maps, pixel_report
 from core.reductions import share_of_pulses
 from core.scene import Scene, scenes
@@ -59,6 +60,7 @@ def warm_up(
         lambda: flux_model_of(small()),
         *(partial(estimated, method) for method in ([only] if only else ESTIMATORS)),
         lambda: pixel_report(small(), estimated(only or "tracking"), 0, 0),
+        lambda: neighbour_median(small()),  # imports `scipy.ndimage`
     ]
     if only is None:
         steps += [
