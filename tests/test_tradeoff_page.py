@@ -132,6 +132,35 @@ def test_a_result_that_cannot_be_drawn_is_reported():
     eventually(lambda: work.shown and "ZeroDivisionError" in work.shown[-1])
 
 
+@pytest.mark.parametrize(
+    ("section_of", "study", "not_begun", "counted"),
+    [
+        (SpeedSection, "speed.study", text.NOT_MEASURED, "images"),
+        (AcquisitionSection, "acquisition.acquisition_sweeps", text.NOT_SIMULATED, "captures"),
+    ],
+)
+def test_a_failed_study_says_so_and_starts_on_another_capture(
+    session, monkeypatch, section_of, study, not_begun, counted
+):
+    def fail(*_, **__):
+        raise ValueError("Not today.")
+
+    with monkeypatch.context() as failing:
+        failing.setattr(f"app.pages.tradeoff.{study}", fail)
+        section = section_of(session)
+        session.estimate.changed.subscribe(section.follow)
+        section.show(True)
+        assert section.subject.text == not_begun
+        session.tasks.run_until(lambda: section.study.has_failed)
+        assert section.subject.text == text.FAILED
+        change(session, method="peak")  # on the same capture
+        assert section.subject.text == text.FAILED
+    change(session, source="wall")
+    assert section.subject.text == not_begun
+    session.tasks.run_until(lambda: counted in section.study.sentence.text)
+    section.study.cancel()
+
+
 # -- speed and accuracy ----------------------------------------------------------------------------
 
 
@@ -235,26 +264,6 @@ def test_any_method_is_shown_on_explore(measured):
     assert control(layout, "Guard").value == 9
 
 
-def test_a_failed_measurement_says_so_and_starts_on_another_capture(session, monkeypatch):
-    def fail(*_, **__):
-        raise ValueError("Not today.")
-
-    with monkeypatch.context() as failing:
-        failing.setattr("app.pages.tradeoff.speed.study", fail)
-        section = SpeedSection(session)
-        session.estimate.changed.subscribe(section.follow)
-        section.show(True)
-        assert section.subject.text == text.NOT_MEASURED
-        session.tasks.run_until(lambda: section.study.has_failed)
-        assert section.subject.text == text.FAILED
-        change(session, method="peak")  # on the same capture
-        assert section.subject.text == text.FAILED
-    change(session, source="wall")
-    assert section.subject.text == text.NOT_MEASURED
-    session.tasks.run_until(lambda: "images" in section.study.sentence.text)
-    section.study.cancel()
-
-
 # -- acquisition -----------------------------------------------------------------------------------
 
 
@@ -279,26 +288,6 @@ def test_a_simulation_like_a_file_is_acquired_in_other_ways(session):
 def test_the_simulation_can_be_cancelled(session):
     with pytest.raises(Cancelled):
         AcquisitionSection(session).work()(cancelled)
-
-
-def test_a_study_that_failed_says_so_and_starts_with_another_scene(session, monkeypatch):
-    def fail(*_, **__):
-        raise ValueError("Not today.")
-
-    with monkeypatch.context() as failing:
-        failing.setattr("app.pages.tradeoff.acquisition.acquisition_sweeps", fail)
-        section = AcquisitionSection(session)
-        session.estimate.changed.subscribe(section.follow)
-        section.show(True)
-        assert section.subject.text == text.NOT_SIMULATED
-        session.tasks.run_until(lambda: section.study.has_failed)
-        assert section.subject.text == text.FAILED
-        change(session, method="peak")  # of the same scene
-        assert section.subject.text == text.FAILED
-    change(session, source="wall")
-    assert section.subject.text == text.NOT_SIMULATED
-    session.tasks.run_until(lambda: "captures" in section.study.sentence.text)
-    section.study.cancel()
 
 
 # -- ablation --------------------------------------------------------------------------------------
