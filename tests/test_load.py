@@ -15,7 +15,8 @@ def test_all_sessions_are_answered_and_interactions_leave_no_memory():
     with serving() as address:  # of its own, since its memory is measured
         resident_mb = server_mb(address)
         used = asyncio.run(load(address, resident_mb, sessions=2, seconds=1.5, forgotten_s=0.0))
-        grown = asyncio.run(growth(address, resident_mb, interactions=40, warm=20))
+        # Until then, what is loaded when it is first used counts, too.
+        grown = asyncio.run(growth(address, resident_mb, interactions=40, warm=60))
     assert used.troubles == grown.troubles == []
     assert used.latencies_s.size > 40
     assert used.session_mb <= Bounds().session_mb
