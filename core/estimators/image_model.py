@@ -153,7 +153,6 @@ def _flux_priors(capture: Capture) -> Iterator[tuple[FluxPrior, Capture | None]]
             levels=prior.levels / each,
             background=prior.background / each,
             own_weight=own.own_weight,
-            at_total=prior.at_total and prior.at_total / each,
         )
         yield per_pixel, replace(pooled, flux_prior=prior)
 
@@ -300,7 +299,7 @@ def with_any_level(capture: Capture, flux: FluxModel, empty: float) -> FluxModel
         flux.contrast,
         flux.pile_up,
         flux.background_shape,
-        known.at_total,
+        known.is_in_proportion,
     )
     return replace(flux_model_with(capture, prior), agreement=flux.agreement)
 

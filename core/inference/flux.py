@@ -4,7 +4,7 @@ The distributions of signal levels and of delays are estimated from a sample of 
 (nonparametric maximum likelihood of a mixing distribution, Kiefer & Wolfowitz 1956, on a grid of
 levels that includes "no echo"). The background of a pixel is its total rate minus the signal level.
 
-Signals are alike over the image, or in proportion to the totals of the pixels, whichever is
+Signals are alike over the image, or in proportion to the backgrounds of the pixels, whichever is
 likelier: a surface that reflects less of the pulse often reflects less of the sunlight, too.
 
 At a low SBR single pixels hardly show their level, and a signal that is not found raises the
@@ -32,7 +32,7 @@ from core.inference.background import (
     mean_background,
     nodes_of,
 )
-from core.inference.flux_model import FluxModel, FluxPrior, Totals
+from core.inference.flux_model import LEAST_BRIGHTNESS, FluxModel, FluxPrior, Totals
 from core.inference.likelihood import (
     level_densities,
     level_evidence,
@@ -57,8 +57,8 @@ _LAST_DEPTH_STEPS = 30  # likewise, from a distribution that is already found
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _CLEAR = 1.0  # mean gain in log likelihood of pixels that show their signal levels one by one
-_MOST_OF_SCATTER = 0.5  # of the totals, due to backgrounds, for which signals may depend on them
-_LEAST_GAIN_IN_PROPORTION = 10.0  # of all pixels, for signals that depend on the totals
+_MOST_OF_SCATTER = 0.5  # of the totals, due to backgrounds, for signals in proportion to them
+_LEAST_GAIN_IN_PROPORTION = 10.0  # of all pixels, for signals in proportion to backgrounds
 _LEAST_JOINT_GAIN = 15.0  # of all pixels; without echoes it was at most 9 in 96 captures
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _MARGIN = 5  # times as many, which chance may leave instead
@@ -230,16 +230,19 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, _Sha
 
     Where pixels differ in their backgrounds, signals may be in proportion to them.
     """
-    alike = _estimated(capture, shape, None)
+    alike = _estimated(capture, shape, in_proportion=False)
     if alike[0].own_weight < _MOST_OF_SCATTER:
         return alike
-    in_proportion = _estimated(capture, shape, float(_totals(capture).of.rate.mean()))
-    gain = _log_likelihood(capture, in_proportion[0]) - _log_likelihood(capture, alike[0])
-    return in_proportion if gain > _LEAST_GAIN_IN_PROPORTION else alike
+    proportional = _estimated(capture, shape, in_proportion=True)
+    if proportional[0].own_weight == 0:
+        return alike
+    gain = _log_likelihood(capture, proportional[0], with_totals=True)
+    gain -= _log_likelihood(capture, alike[0], with_totals=True)
+    return proportional if gain > _LEAST_GAIN_IN_PROPORTION else alike
 
 
 def _estimated(
-    capture: Capture, shape: Floats | None, at_total: float | None
+    capture: Capture, shape: Floats | None, in_proportion: bool
 ) -> tuple[FluxPrior, _Shapes]:
     """Estimate `_flux_prior` with signals that depend on the totals of pixels, or do not.
 
@@ -249,10 +252,11 @@ def _estimated(
     background, all get the same value. Where all pulses fire, only the background of a pixel is
     known (`_background_of`), from which no signal is subtracted.
     """
-    (total, has_signal, _), chance, _ = _totals(capture)
+    totals, chance, _ = _totals(capture)
+    total, has_signal, _ = totals
     flat, signal_share = capture.cube.reshape(total.size, -1), float(has_signal.mean())
     pixels, least = _sampled(total.size, SAMPLE), _least_background(capture)
-    levels = _levels(pixels, capture, shape, at_total)
+    levels = _levels(pixels, capture, shape, in_proportion)
     # Initially each level is the signal of all pixels; a few pixels show how many have it.
     found = FluxPrior(
         levels,
@@ -261,9 +265,9 @@ def _estimated(
         background=total.mean() - signal_share * levels[:, np.newaxis, np.newaxis],
         own_weight=_own_weight(total, chance),
         background_shape=shape,
-        at_total=at_total,
+        is_in_proportion=in_proportion,
     )
-    start, squared = found, float((found.brightness(total) ** 2).mean())
+    start, squared = found, float((found.brightness(totals)[0] ** 2).mean())
     for some in (_sampled(total.size, SAMPLE // 4), pixels):
         flux = _model_of_pixels(capture, found, some, least)
         evidence = level_evidence(prepare(capture, flat[np.newaxis, some], flux, 1))
@@ -367,12 +371,25 @@ def _mean_log_likelihood(evidence: _Evidence, share: Floats) -> float:
     return float((np.log(evidence.likelihood @ share) + evidence.highest).mean())
 
 
-def _log_likelihood(capture: Capture, flux_prior: FluxPrior) -> float:
-    """Log likelihood of a sample of the pixels."""
-    pixels = _sampled(capture.counts.size, DEPTH_SAMPLE)
-    background = np.maximum(flux_prior.background, _least_background(capture))
-    log = level_likelihoods(capture, pixels, flux_prior._replace(background=background), 1)
-    return pixels.size * _mean_log_likelihood(_relative(log), flux_prior.share)
+def _log_likelihood(capture: Capture, flux_prior: FluxPrior, with_totals: bool = False) -> float:
+    """Log likelihood of a sample of the pixels, if required with that of their own backgrounds.
+
+    Own backgrounds follow from the totals. The density of these is the normal one of the
+    backgrounds, times their derivative by the total: ``B / (B + s)`` if background and signal share
+    it in proportion.
+    """
+    pixels, least = _sampled(capture.counts.size, DEPTH_SAMPLE), _least_background(capture)
+    known = flux_prior._replace(background=np.maximum(flux_prior.background, least))
+    log = level_likelihoods(capture, pixels, known, 1)
+    if with_totals:
+        totals = _totals(capture).of
+        own = known.model(totals.of_pixels(pixels), least).background[:, 0].T
+        variance = known.own_weight * float(totals.rate.var())
+        log -= ((own - known.background) ** 2 / variance + math.log(variance)) / 2
+        if known.is_in_proportion:
+            has_signal = totals.has_signal.ravel()[pixels, np.newaxis]
+            log -= np.log1p(known.levels * has_signal / known.background)
+    return pixels.size * _mean_log_likelihood(_relative(log), known.share)
 
 
 def _shares_of_one_level(capture: Capture, start: FluxPrior) -> Floats:
@@ -596,13 +613,15 @@ def _own_weight(total: Floats, unrelated: float) -> float:
 
 
 def _levels(
-    pixels: NDArray[np.intp], capture: Capture, shape: Floats | None, at_total: float | None
+    pixels: NDArray[np.intp], capture: Capture, shape: Floats | None, in_proportion: bool
 ) -> Floats:
     """Signal levels: 0, and a geometric grid up to the strongest echoes of pixels."""
     flat = capture.cube.reshape(-1, capture.cube.shape[2])
     excess = _largest_excess(flat[pixels], capture, shape)
-    if at_total is not None:
-        excess *= at_total / np.maximum(_totals(capture).of.rate.ravel()[pixels], 1e-9 * at_total)
+    if in_proportion:
+        totals = _totals(capture).of.of_pixels(pixels)
+        left = np.maximum(totals.rate - excess * totals.has_signal, 0.0)[0]
+        excess /= np.maximum(left / (left.mean() or 1.0), LEAST_BRIGHTNESS)
     top = max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
     return np.concatenate([[0.0], np.geomspace(top / LEVEL_SPAN, top, LEVELS)])
 

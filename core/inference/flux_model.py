@@ -26,8 +26,11 @@ class Agreement(NamedTuple):
 UNRELATED = Agreement(0.0, 0.0, 1.0)
 """Agreement of an image whose neighbouring pixels carry no information about each other."""
 
+_TINY = 1e-100  # photons, instead of none
 
-_LEAST_BRIGHTNESS = 0.25
+LEAST_BRIGHTNESS = 0.25
+"""Of dark pixels, relative to the mean: with less, no count would speak against an echo where there
+is no surface, as in the sky."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,24 +140,25 @@ class FluxPrior(NamedTuple):
     """`FluxModel.pile_up`."""
     background_shape: Floats | None = None
     """`FluxModel.background_shape`."""
-    at_total: float | None = None
-    """Total rate of a pixel with signals of `levels`; those of others are in proportion to theirs,
-    as where a surface reflects signal and sunlight alike. None if signals do not depend on it."""
+    is_in_proportion: bool = False
+    """Whether the signal of a pixel is in proportion to its background, as where a surface reflects
+    signal and sunlight alike. Then `levels` are those of a pixel with the mean background."""
 
     @property
     def relative_background(self) -> Floats:
         """`background_shape`, or 1 in each bin."""
         return _ones_unless(self.background_shape, self.depth)
 
-    def brightness(self, total: Floats) -> Floats:
-        """Return the signals of pixels relative to `levels`, given their total rates, any shape.
+    def brightness(self, totals: Totals) -> Floats:
+        """Return the signals of pixels relative to `levels`, shape (level, row, col).
 
-        Of dark pixels at least `_LEAST_BRIGHTNESS`: with less, no count would speak against an echo
-        where there is no surface, as in the sky.
+        At least `LEAST_BRIGHTNESS`.
         """
-        if self.at_total is None:
-            return np.ones_like(total)
-        return np.maximum(total / self.at_total, _LEAST_BRIGHTNESS)
+        levels = self.levels[:, np.newaxis, np.newaxis]
+        if not self.is_in_proportion:
+            return np.ones((levels.size, *totals.rate.shape))
+        of_mean_pixel = np.maximum(self.background, 0.0) + levels * totals.has_signal
+        return np.maximum(totals.rate / np.maximum(of_mean_pixel, _TINY), LEAST_BRIGHTNESS)
 
     def with_one_level(self) -> FluxPrior:
         """Return the prior with all signal levels replaced by their mean."""
@@ -167,8 +171,8 @@ class FluxPrior(NamedTuple):
         total, has_signal, chance = totals
         shape, levels = (self.levels.size, *total.shape), self.levels[:, np.newaxis, np.newaxis]
         mean = np.broadcast_to(self.background, levels.shape)
-        if self.at_total is not None:
-            levels = levels * self.brightness(total)
+        if self.is_in_proportion:
+            levels = levels * self.brightness(totals)
         if self.own_weight == 0:  # one number per level
             background = np.broadcast_to(np.maximum(mean, least_background), shape)
         else:

@@ -21,7 +21,7 @@ from scipy.special import ndtr
 
 from core.acquisition import Floats
 from core.capture import Capture
-from core.inference.flux import flux_model_of, flux_model_with, flux_prior_of, total_rates
+from core.inference.flux import flux_model_of, flux_model_with, flux_prior_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import LikelihoodInput, prepared_groups
 from core.inference.neighbours import box_sum
@@ -431,7 +431,7 @@ def flux_at_rest(capture: Capture, groups: PulseGroups, travel_bins: Floats) -> 
         own_weight=found.own_weight,
         contrast=found.contrast and found.contrast / share,
         background_shape=shape,
-        at_total=found.at_total and float(total_rates(capture).mean()),
+        is_in_proportion=found.is_in_proportion,
     )
     return flux_model_with(capture, prior)
 

@@ -6,8 +6,8 @@ over uniform delays, give a likelihood of mean signal and mean background, maxim
 shape, and profile likelihood intervals as for a single pixel (`core.inspection.flux`).
 
 Where pixels differ in their backgrounds, the likelihood only gives the signal; the mean background
-is what it leaves of the total. Where signals are in proportion to the totals
-(`core.inference.flux`), the gamma distribution is that of the signal of a mean total.
+is what it leaves of the total. Where signals are in proportion to the backgrounds
+(`core.inference.flux`), the likelihood gives the ratio of both; they add up to the total.
 
 The maximum-likelihood gamma distribution has the mean of the observed signals, whatever their
 true distribution, so that the model need not be exact where signals are clear.
@@ -44,6 +44,7 @@ from core.inference.flux import (
     SAMPLE,
     background_in_strong_sun,
     detailed_flux_prior_of,
+    flux_model_with,
     has_many_spent,
     level_likelihoods,
     level_shares,
@@ -52,7 +53,16 @@ from core.inference.flux import (
 from core.inference.flux_model import FluxPrior
 from core.inspection.echoes import darkest_flux, echo_free_flux, total_flux
 from core.inspection.flux import estimate_flux
-from core.inspection.profile import LEVEL, Box, FluxEstimate, difference_of, ratio_of, spans, zoomed
+from core.inspection.profile import (
+    LEVEL,
+    Box,
+    FluxEstimate,
+    difference_of,
+    product_of,
+    ratio_of,
+    spans,
+    zoomed,
+)
 from core.inspection.pulse_fit import fit_pulse
 from core.kernels.posterior import learn_shares
 from core.metrics import Interval
@@ -153,12 +163,19 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     model, target = (each.of(some).scaled(scale) for each in (mixture.image, mixture.target))
     # Few unfired pulses show too small a total.
     total = None if has_many_spent(ordinary) else total_flux(ordinary)
-    known = background_in_strong_sun(ordinary)
-    if mixture.has_own_backgrounds and known is not None:
-        mean, half = known[0], _SIGMAS * known[1]
-        background = Interval(mean, mean - half, mean + half)
-        whole = FluxEstimate(model.signal, background, ratio_of(model.signal, background))
-    elif mixture.has_own_backgrounds and total is not None:
+    has_own_backgrounds, at_background = mixture.has_own_backgrounds, mixture.at_background
+    known = _in_strong_sun(ordinary) if has_own_backgrounds else None
+    if at_background is not None:
+        # The likelihood tells signals relative to backgrounds; both add up to the total.
+        sbr, of_target = (
+            each.signal.scaled(1 / at_background) for each in (mixture.image, mixture.target)
+        )
+        background = known or (total and _below_signal(total, sbr)) or model.background
+        model = whole = FluxEstimate(product_of(sbr, background), background, sbr)
+        target = FluxEstimate(product_of(of_target, background), background, of_target)
+    elif known is not None:
+        whole = FluxEstimate(model.signal, known, ratio_of(model.signal, known))
+    elif has_own_backgrounds and total is not None:
         whole = _below_total(model.signal, total)
     else:
         whole = _with_total(model, total)
@@ -167,7 +184,7 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     signal = (
         _at_same_share(target.signal, model.signal, whole.signal) if is_whole else target.signal
     )
-    if signal != target.signal or mixture.has_own_backgrounds:
+    if signal != target.signal or (has_own_backgrounds and at_background is None):
         sbr = ratio_of(signal, whole.background)
         target = FluxEstimate(signal, whole.background, sbr)
     free, darkest = echo_free_flux(capture), darkest_flux(capture)
@@ -193,6 +210,20 @@ def _joined(found: FluxEstimate, other: FluxEstimate) -> FluxEstimate:
         found.background.joined(other.background),
         found.sbr.joined(other.sbr),
     )
+
+
+def _in_strong_sun(capture: Capture) -> Interval | None:
+    """Return `background_in_strong_sun` with its 95 % interval."""
+    known = background_in_strong_sun(capture)
+    if known is None:
+        return None
+    mean, half = known[0], _SIGMAS * known[1]
+    return Interval(mean, mean - half, mean + half)
+
+
+def _below_signal(total: Interval, sbr: Interval) -> Interval:
+    """Return the background that a signal in proportion to it leaves of the total."""
+    return ratio_of(total, Interval(1 + sbr.value, 1 + sbr.low, 1 + sbr.high))
 
 
 def _below_total(signal: Interval, total: Interval) -> FluxEstimate:
@@ -287,7 +318,7 @@ def _unresolved(capture: Capture) -> FluxEstimate:
 def _dimmer(capture: Capture) -> tuple[Capture, float]:
     """Reduce the pulses of a capture whose echoes are brighter than the mean requires."""
     known = detailed_flux_prior_of(capture)
-    strongest = float(known.levels[-1] * known.brightness(total_rates(capture)).max())
+    strongest = float(flux_model_with(capture, known).signal[-1].max())
     share = _BRIGHT / max(strongest * (capture.gated_pulses or 1), _BRIGHT)
     return (share_of_pulses(capture, share), share) if share < 1 else (capture, 1.0)
 
@@ -308,8 +339,10 @@ class _Mixture:
         self._levels = np.linspace(0.0, math.sqrt(top), count + 1) ** 2
         # Photons of the strongest echo determine its delay; between two, it would seem longer.
         self._steps = max(_STEPS[0], _STEPS[1] * math.sqrt(top / 2 * n_pulses))
+        background = max(float(known.background), 0.5 / n_pulses)
         self._known = known._replace(
             levels=self._levels,
+            background=np.asarray(background),
             share=np.full(self._levels.size, 1 / self._levels.size),
             # Without pile-up, the likelihood averaged over uniform delays is the same wherever
             # the echoes lie; a distribution learned from few photons would bias it.
@@ -318,7 +351,6 @@ class _Mixture:
         )
         mean = max(float(known.share @ known.levels), top / 1e3)
         bright = max(mean / float(known.share[1:].sum()), mean)
-        background = max(float(known.background), 0.5 / n_pulses)
         chance = math.sqrt(float(total.mean()) / n_pulses / pixels.size)
         half = min(4 * chance / background, 1.0)
         if capture.gated_pulses is not None and total.size >= 2 * _SAMPLE:
@@ -345,6 +377,11 @@ class _Mixture:
         bright = min(math.sqrt(bright), box.most[1] / 2)
         box = box._replace(low=(box.low[0], 0.8 * bright), high=(box.high[0], 1.2 * bright))
         self.target = self._with_any_distribution(self._estimated(box, of_target=True)[1])
+
+    @property
+    def at_background(self) -> float | None:
+        """Background of a pixel with the signals of the estimates, if they are in proportion."""
+        return float(self._known.background) if self._known.is_in_proportion else None
 
     @property
     def has_own_backgrounds(self) -> bool:
@@ -452,7 +489,8 @@ class _Mixture:
             delays_per_echo * self._sample.acquisition.bin_width_s / (end_s - begin_s)
         )
         steps = min(steps, _MOST_STEPS)
-        prior = prior._replace(background=np.asarray(math.exp(log_background)))
+        if self.at_background is None:
+            prior = prior._replace(background=np.asarray(math.exp(log_background)))
         return level_likelihoods(sample, pixels, prior, steps)
 
     def _log_likelihood(self, log_background: Floats, signal: Floats, of_target: bool) -> Floats:

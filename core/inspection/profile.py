@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import astuple
 from typing import NamedTuple
 
 import numpy as np
@@ -89,6 +90,14 @@ def ratio_of(one: Interval, other: Interval) -> Interval:
     smaller = math.hypot(_log(one.value, one.low), _log(other.high, other.value))
     larger = math.hypot(_log(one.high, one.value), _log(other.value, other.low))
     return Interval(value, value * math.exp(-smaller), value * math.exp(larger))
+
+
+def product_of(one: Interval, other: Interval) -> Interval:
+    """Interval of the product of independent, non-negative estimates, as `ratio_of`."""
+    if one.value == 0 or other.value == 0:
+        return Interval(0.0, 0.0, one.high * other.high)
+    value, high, low = (1 / each if each > 0 else math.inf for each in astuple(other))
+    return ratio_of(one, Interval(value, low, high))
 
 
 def _log(above: float, below: float) -> float:

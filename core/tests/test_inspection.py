@@ -22,14 +22,14 @@ from core.capture import Capture
 from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.geometry import Box
-from core.inference import TOLERANCE_BINS
+from core.inference import TOLERANCE_BINS, flux_prior_of
 from core.inference.faults import outlier_pixels, pixel_verdict, probability_of_fewer
 from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.maps import likeliest
 from core.inspection.mean_flux import largest_fit, mean_flux_of
 from core.inspection.profile import Box as Bounds
-from core.inspection.profile import difference_of, ratio_of, zoomed
+from core.inspection.profile import difference_of, product_of, ratio_of, zoomed
 from core.metrics import Interval, restored
 from core.reductions import cut_gate, share_of_pulses
 from core.scene import Scene, scenes
@@ -382,8 +382,10 @@ def test_mean_fluxes_in_strong_sun_are_right(reflectivity: tuple[float, float]) 
     rate += background * factor[..., np.newaxis] / acquisition.n_bins
     for seed in range(4):
         counts = draw_counts(rate, acquisition.n_pulses, np.random.default_rng(seed))
-        found = mean_flux_of(Capture(counts, acquisition))
+        capture = Capture(counts, acquisition)
+        found = mean_flux_of(capture)
         assert found.pulse == Pulse()
+        assert flux_prior_of(capture).is_in_proportion == (reflectivity[0] < 1)
         mean = factor.mean()
         assert found.image.signal.value == pytest.approx(signal * mean, rel=0.1)
         assert found.image.background.value == pytest.approx(background * mean, rel=0.02)
@@ -775,6 +777,17 @@ def test_flux_depends_neither_on_the_pulse_nor_on_the_bins() -> None:
             assert abs((one.high + one.low) / 2 - value) < half
 
 
+@pytest.mark.parametrize("regime", [-2, -1])
+def test_mean_signals_are_right_whether_or_not_they_vary_with_the_background(regime: int) -> None:
+    signals = []
+    for seed in range(4):
+        captures, truth = FLUX_REGIMES[regime].captures(seed)
+        signals.append(inspection.estimate_target_flux(captures[-1]).signal.value / truth[1][0])
+        if regime == -2:
+            assert not flux_prior_of(captures[-1]).is_in_proportion
+    assert np.mean(signals) == pytest.approx(1, abs=0.05)
+
+
 def test_the_search_for_fluxes_ends_around_their_peak() -> None:
     start = Bounds((-2.5, 0.95), (-1.3, 2.05), (-15.0, 0.0), (12.0, 5.3))
     for peak, sd in product(np.linspace(0, 5, 101), (0.05, 0.1, 0.2, 0.3, 0.5)):
@@ -843,9 +856,9 @@ def test_a_report_says_where_bins_without_echoes_contradict_the_model() -> None:
     assert report.flux.background.low <= free.low and free.high <= report.flux.background.high
 
 
-def test_intervals_of_differences_and_ratios_cover_the_truth() -> None:
+def test_intervals_of_differences_ratios_and_products_cover_the_truth() -> None:
     rng, trials, mean = np.random.default_rng(5), 400, (30.0, 12.0)
-    tail, hits = 0.5 - inspection.LEVEL / 2, np.zeros(2, int)
+    tail, hits = 0.5 - inspection.LEVEL / 2, np.zeros(3, int)
     for pair in rng.poisson(mean, (trials, 2)):
         one, other = (
             Interval(n, stats.gamma.ppf(tail, n) if n else 0.0, stats.gamma.isf(tail, n + 1))
@@ -853,10 +866,12 @@ def test_intervals_of_differences_and_ratios_cover_the_truth() -> None:
         )
         hits[0] += covers(difference_of(one, other), mean[0] - mean[1])
         hits[1] += covers(ratio_of(one, other), mean[0] / mean[1])
+        hits[2] += covers(product_of(one, other), mean[0] * mean[1])
     assert all(is_covered_often_enough(each, trials) for each in hits), hits
     nothing, some = Interval(0.0, 0.0, 3.7), Interval(4.0, 1.1, 10.2)
     assert ratio_of(some, nothing).value == ratio_of(some, nothing).high == math.inf
     assert ratio_of(nothing, some).value == ratio_of(nothing, some).low == 0.0
+    assert product_of(nothing, some).value == product_of(some, nothing).value == 0.0
     assert difference_of(nothing, some) == Interval(0.0, 0.0, difference_of(nothing, some).high)
 
 

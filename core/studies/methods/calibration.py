@@ -305,7 +305,7 @@ class FluxRegime:
         Those of the mean pixel and of the mean target pixel: signal, background and SBR.
         """
         rng, width_s = np.random.default_rng(seed), BIN_WIDTHS_S[0]
-        n_pulses, signal, background, unevenness = FLUXES[self.photons]
+        n_pulses, signal, background, unevenness, in_proportion = FLUXES[self.photons]
         acquisition = Acquisition(round(_GATE_S / width_s), width_s, n_pulses=n_pulses)
         shape = (_FLUX_SIDE, _FLUX_SIDE)
         low, high = _DEPTHS[self.depths]
@@ -314,7 +314,10 @@ class FluxRegime:
         target = np.isfinite(onset)
         signals = np.where(target, signal * rng.gamma(4, 1 / 4, shape), 0.0)
         pulse = changed(_ASSUMED_PULSE, *TRUE_PULSES[self.pulse], _RESOLUTION_S)
-        backgrounds = background * rng.uniform(1 - unevenness, 1 + unevenness, shape)
+        brightness = rng.uniform(1 - unevenness, 1 + unevenness, shape)
+        backgrounds = background * brightness
+        if in_proportion:
+            signals *= brightness
         rate = rate_per_bin(onset, signals, 0.0, pulse, acquisition)
         rate += backgrounds[..., np.newaxis] / acquisition.n_bins
         cube = draw_counts(rate, n_pulses, rng)
@@ -326,13 +329,14 @@ class FluxRegime:
 
 
 FLUXES = {
-    "all": (None, 3.5, 0.25, 0.0),
-    "first": (200, 0.3, 1.0, 0.0),
-    "first, SBR 0.03": (1000, 0.1041, 3.47, 0.0),
-    "first, uneven background": (200, 0.3, 1.0, 0.5),
+    "all": (None, 3.5, 0.25, 0.0, False),
+    "first": (200, 0.3, 1.0, 0.0, False),
+    "first, SBR 0.03": (1000, 0.1041, 3.47, 0.0, False),
+    "first, uneven background": (200, 0.3, 1.0, 0.5, False),
+    "first, uneven reflectivity": (200, 0.3, 1.0, 0.5, True),
 }
-"""Pulses; mean signal of a target pixel and background per pulse, of all pulses if None; and the
-largest relative deviation of a pixel's background."""
+"""Pulses; mean signal of a target pixel and background per pulse, of all pulses if None; the
+largest relative deviation of a pixel's background; and whether its signal deviates likewise."""
 
 TRUE_PULSES = {
     "as assumed": (1.0, 0.0, 0.0),
@@ -352,6 +356,7 @@ FLUX_REGIMES = (
     ),
     FluxRegime("first, SBR 0.03", "middle", "as assumed"),
     FluxRegime("first, uneven background", "whole", "as assumed"),
+    FluxRegime("first, uneven reflectivity", "whole", "as assumed"),
 )
 _DEPTHS = {"middle": (0.4, 0.6), "whole": (0.06, 0.8)}
 _ASSUMED_PULSE, _RESOLUTION_S = Pulse.gaussian(1e-9), 0.05e-9
