@@ -253,8 +253,8 @@ def _estimated(
     known (`_background_of`), from which no signal is subtracted.
     """
     totals, chance, _ = _totals(capture)
-    total, has_signal, _ = totals
-    flat, signal_share = capture.cube.reshape(total.size, -1), float(has_signal.mean())
+    total, signal_share = totals.rate, totals.signal_share(in_proportion)
+    flat = capture.cube.reshape(total.size, -1)
     pixels, least = _sampled(total.size, SAMPLE), _least_background(capture)
     levels = _levels(pixels, capture, shape, in_proportion)
     # Initially each level is the signal of all pixels; a few pixels show how many have it.
@@ -290,8 +290,8 @@ def _estimated(
 
 def _completed(capture: Capture, found: FluxPrior, share: Floats) -> tuple[FluxPrior, _Shapes]:
     """Return `_flux_prior`, given the shares of the coarse grid of levels that `found` has."""
-    (total, has_signal, _), *_ = _totals(capture)
-    signal_share = float(has_signal.mean())
+    totals = _totals(capture).of
+    total, signal_share = totals.rate, totals.signal_share(found.is_in_proportion)
     mean = signal_share * (share @ found.levels)
     levels, share, pair = _halved(found.levels, share, _kept(share))
     found = found._replace(levels=levels, share=share, background=total.mean() - mean)
@@ -541,7 +541,12 @@ def _totals(capture: Capture) -> _Totals:
         some = capture.counts > n_pulses - _MARGIN * _TOO_FEW
         background, most = _background_of(capture.cube[some], n_pulses), np.sqrt(variance[some])
         most = background + _CLEARLY_MORE * most
-        has_signal[some] = (background < math.log(n_pulses / _TOO_FEW)) | (total[some] > most)
+        # Few pulses tell the background badly: it is shrunk to the median as far as chance explains
+        # how many pulses of the pixels do not fire.
+        chance = float((unfired * (n_pulses - unfired)).mean()) / n_pulses
+        middle = float(np.median(background))
+        shrunk = middle + _own_weight(unfired, chance) * (background - middle)
+        has_signal[some] = (shrunk < math.log(n_pulses / _TOO_FEW)) | (total[some] > most)
         total[some] = np.where(has_signal[some], total[some], background)
         variance[~has_signal] = _VARIANCE_OF_MEDIAN * total[~has_signal] ** 2 / n_pulses
     pixels = _with_chance(total, has_signal, variance)
@@ -571,8 +576,8 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
         rate, armed = rate_and_n_armed(pixels[some].astype(float), n_pulses)
         if n_parts < pixels.shape[1]:
             rate, armed = _in_parts(rate, armed, n_parts)
-        # The median of a Poisson variable is about 1/3 less than its mean.
-        rate += 1 / (3 * np.maximum(armed, 1))
+        # The median of a Poisson variable, an integer, is 1/6 less than its mean on average.
+        rate += 1 / (6 * np.maximum(armed, 1))
         median[some] = weighted_median(rate.T, armed.T)
     at_once = pixels[:, 0] >= n_pulses
     median[at_once] = math.log(2 * n_pulses * max(int(at_once.sum()), 1))

@@ -111,6 +111,10 @@ class Totals(NamedTuple):
     chance: Floats
     """Its variance due to chance, relative to the mean over the image, and 1 at most."""
 
+    def signal_share(self, in_proportion: bool) -> float:
+        """Return the share of the mean signal of the pixels that the mean total includes."""
+        return float(np.average(self.has_signal, weights=self.rate if in_proportion else None))
+
     def of_pixels(self, pixels: NDArray[np.intp]) -> Totals:
         """Return the totals of some pixels, given as flat indices, in one row."""
         return Totals(

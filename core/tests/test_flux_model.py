@@ -250,7 +250,7 @@ def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
 
 @pytest.mark.compiled
 @pytest.mark.parametrize(
-    ("signal", "background", "n_pulses"), [(0.6, 0.3, 20), (0.3, 0.7, 20), (0.6, 0.3, 10)]
+    ("signal", "background", "n_pulses"), [(0.6, 0.3, 20), (0.3, 1.0, 20), (0.6, 0.3, 10)]
 )
 def test_few_pulses_are_not_taken_for_a_strong_background(
     signal: float, background: float, n_pulses: int
@@ -267,6 +267,16 @@ def test_few_pulses_are_not_taken_for_a_strong_background(
     right = np.abs(image.range_m - scene.range_m) < 3 * acquisition.bin_length_m
     assert image.confidence.mean() == pytest.approx(right.mean(), abs=0.03)
     assert "unreliable" not in image.made_by.remark
+
+
+@pytest.mark.parametrize(("n_pulses", "bias"), [(200, 0.02), (1000, 0.005)])
+def test_the_background_that_spends_all_pulses_is_that_of_the_median_bin(
+    n_pulses: int, bias: float
+) -> None:
+    """The median of a few counts is a sixth of a count below their mean."""
+    acquisition, rng = Acquisition(n_bins=150, n_pulses=n_pulses), np.random.default_rng(0)
+    counts = draw_counts(np.full((40, 50, 150), 8 / 150), n_pulses, rng)
+    assert total_rates(Capture(counts, acquisition)).mean() == pytest.approx(8, rel=bias)
 
 
 @pytest.mark.parametrize("exposure", [3, 4, 6])
