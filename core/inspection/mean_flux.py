@@ -7,7 +7,8 @@ shape, and profile likelihood intervals as for a single pixel (`core.inspection.
 
 Where pixels differ in their backgrounds, the likelihood only gives the signal; the mean background
 is what it leaves of the total. Where signals are in proportion to the backgrounds
-(`core.inference.flux`), the likelihood gives the ratio of both; they add up to the total.
+(`core.inference.flux`), the likelihood gives the ratio of both, which is multiplied by the
+brightness of the pixels that have an echo; both add up to the total.
 
 The maximum-likelihood gamma distribution has the mean of the observed signals, whatever their
 true distribution, so that the model need not be exact where signals are clear.
@@ -168,7 +169,8 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     if at_background is not None:
         # The likelihood tells signals relative to backgrounds; both add up to the total.
         sbr, of_target = (
-            each.signal.scaled(1 / at_background) for each in (mixture.image, mixture.target)
+            product_of(each.signal.scaled(1 / at_background), mixture.brightness_of_targets)
+            for each in (mixture.image, mixture.target)
         )
         background = known or (total and _below_signal(total, sbr)) or model.background
         model = whole = FluxEstimate(product_of(sbr, background), background, sbr)
@@ -384,6 +386,21 @@ class _Mixture:
         return float(self._known.background) if self._known.is_in_proportion else None
 
     @property
+    def brightness_of_targets(self) -> Interval:
+        """Mean brightness of the pixels with an echo, relative to that of all.
+
+        Where there is no surface, as in the sky, the background is another one. The interval is
+        that of the chance by which the sample differs from the image.
+        """
+        share, likelihood, _ = self._with_free_shares(self._nodes[0])
+        posterior = share * likelihood / (likelihood @ share)[:, np.newaxis]
+        signal = (posterior * flux_model_with(self._sample, self._known).signal[:, 0].T).sum(axis=1)
+        at_mean = posterior @ self._levels
+        mean = float(signal.sum() / at_mean.sum())
+        half = _SIGMAS * math.sqrt(((signal - mean * at_mean) ** 2).sum()) / float(at_mean.sum())
+        return Interval(mean, max(mean - half, 0.0), mean + half)
+
+    @property
     def has_own_backgrounds(self) -> bool:
         """Whether pixels differ in their backgrounds.
 
@@ -426,11 +443,7 @@ class _Mixture:
         log_background = float(np.clip(math.log(background), *self._nodes[[0, -1]]))
         at = np.array([log_background]), np.array([target.signal.value])
         gamma = self._log_likelihood(*at, of_target=True)[0, 0]
-        log = self._logs_at(log_background)
-        top = log.max(axis=1, keepdims=True)
-        likelihood = np.exp(log - top)
-        share = level_shares(likelihood)
-        free = float(np.log(likelihood @ share).sum() + top.sum())
+        share, _, free = self._with_free_shares(log_background)
         if free < gamma + _CLEARLY_LIKELIER or image.value == 0:
             return target
         mean = float(share @ self._levels)
@@ -443,6 +456,17 @@ class _Mixture:
         found = ends.joined(target.signal)
         sbr = ratio_of(found, self.image.background)
         return FluxEstimate(found, target.background, sbr)
+
+    def _with_free_shares(self, log_background: float) -> tuple[Floats, Floats, float]:
+        """Return the likeliest shares of the levels, and with them the log likelihood.
+
+        Between them the relative likelihoods of the levels of each pixel, (pixel, level).
+        """
+        log = self._logs_at(log_background)
+        top = log.max(axis=1, keepdims=True)
+        likelihood = np.exp(log - top)
+        share = level_shares(likelihood)
+        return share, likelihood, float(np.log(likelihood @ share).sum() + top.sum())
 
     def _sharpened(self, pulse: Pulse, log_background: float) -> FluxPrior:
         """Return the prior with the power of its distribution of delays that is likeliest.
