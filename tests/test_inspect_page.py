@@ -791,6 +791,16 @@ def test_a_report_that_fails_removes_the_previous_one(capture, near, monkeypatch
     assert all(each.disabled for each in capture.apply)
 
 
+def test_the_report_on_another_file_or_scene_is_not_shown(capture, near):
+    near.sources["wall"] = built_in_sources()["wall"]
+    near.state.source = "wall"
+    near.tasks.run_until(lambda: near.answer.request.source is near.sources["wall"])
+    assert capture.report is None and capture.facts.facts == []
+    assert capture.counts.source("window").data["left"] == []
+    near.tasks.run_until(lambda: capture.facts.facts)
+    assert capture.flux.text
+
+
 def test_a_gate_is_applied_to_an_already_reduced_capture(near):
     change(near, reduction=ReductionSettings(merge=2, gate_from=0.1))
     answer = near.answer
@@ -815,7 +825,7 @@ def test_a_gate_of_another_capture_is_not_cut(near):
 def test_accuracy_against_pulses_is_drawn_step_by_step(near):
     section = on_screen(CaptureSection(near), lambda each: len(each.accuracies) == 2)
     drawn = section.accuracy.source("points").data
-    assert drawn["pulses"] == [each.share * 1000 for each in section.accuracies]
+    assert drawn["pulses"] == [each.n_pulses for each in section.accuracies]
     assert drawn["value"] == [each.within.value for each in section.accuracies]
     assert section.view.main
     saved = table_of(section, "accuracy")
@@ -830,6 +840,9 @@ def test_accuracy_against_pulses_is_drawn_step_by_step(near):
     section.pulses.value = 0.25
     near.tasks.run_until(lambda: near.answer.capture.acquisition.n_pulses == 250)
     np.testing.assert_allclose(section.accuracy.source("present").data["x"], 250)
+    change(near, light=replace(near.state.light, n_pulses=12))
+    near.tasks.run_until(lambda: len(section.accuracies) == 4)
+    assert section.accuracy.source("points").data["pulses"] == [1, 1, 1, 2]
     section.show(False)
 
 

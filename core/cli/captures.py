@@ -189,7 +189,7 @@ def _capture_facts(capture: Capture) -> dict[str, Any]:
         [each._asdict() for each in faulty if each.health == health] for health in ("hot", "dead")
     )
     return {
-        "flux_mean_over": "all pixels, empty ones included",
+        "flux_mean_over": "all pixels but hot and dead ones, empty ones included",
         **_flux_facts(report),
         "target_flux_mean_over": "target pixels, those with an echo",
         **_interval("target_signal", target.signal),

@@ -116,7 +116,10 @@ class CaptureSection(Section):
         answer = self.session.answer
         # The estimate may be that of an earlier setting.
         self.pulses.value = self.session.state.reduction.pulses
-        if self._reported is None or answer.capture is not self._reported.capture:
+        shown = self._reported
+        if shown is not None and answer.request.source is not shown.request.source:
+            self._clear()
+        if shown is None or answer.capture is not shown.capture:
             self.flux.text = COMPUTING
         # Counts come at once, the flux later.
         counts, drawn = partial(answer.capture.cube.sum, axis=(0, 1)), self._draw_counts
@@ -152,14 +155,14 @@ class CaptureSection(Section):
         reduction = replace(answer.request.reduction, pulses=1.0)
         return answer.whole, reduction, answer.method, answer.settings
 
-    @property
-    def _all_pulses(self) -> int:
-        """Number of all pulses; 1 where it is not known."""
-        return self.session.answer.whole.acquisition.n_pulses or 1
+    def _pulses_at(self, share: float) -> float:
+        """Return the pulses of a share, as they are drawn; the share if their number is unknown."""
+        n_pulses = self.session.answer.whole.acquisition.n_pulses
+        return share if n_pulses is None else max(1, round(share * n_pulses))
 
     def _steps(self) -> list[Step[Accuracy]]:
         self._studied, self.accuracies = self._study_settings, []
-        ticks = [share * self._all_pulses for share in SHARES]
+        ticks = sorted(set(map(self._pulses_at, SHARES)))
         figure = self.accuracy.figure
         titles = text.accuracy_titles(self.session.answer.whole)
         figure.title.text, figure.xaxis.axis_label, figure.yaxis.axis_label = titles
@@ -171,7 +174,7 @@ class CaptureSection(Section):
     def _add(self, found: Accuracy) -> None:
         known = [(n, within) for n in (*self.accuracies, found) if (within := n.within) is not None]
         points = {
-            "pulses": [each.share * self._all_pulses for each, _ in known],
+            "pulses": [self._pulses_at(each.share) for each, _ in known],
             "value": [within.value for _, within in known],
             "low": [within.low for _, within in known],
             "high": [within.high for _, within in known],
@@ -190,7 +193,7 @@ class CaptureSection(Section):
 
     def _mark_present(self) -> None:
         """Mark the number of pulses that is used at present."""
-        present = self.session.answer.request.reduction.pulses * self._all_pulses
+        present = self._pulses_at(self.session.answer.request.reduction.pulses)
         self.accuracy.mark("present", present)
         marks = plots.marks(inspect_plots.NAMES, present=present)
         self.accuracy.keep(self.accuracy.figure.xaxis.axis_label, self._points + marks)
@@ -215,6 +218,11 @@ class CaptureSection(Section):
 
     def _failed(self, error: Exception) -> None:
         """Remove what was known of another capture, and report why."""
+        self._clear()
+        self.report_error(error)
+
+    def _clear(self) -> None:
+        """Remove what was known of another capture."""
         self.report = self._reported = None
         with self.session.tasks.hold():
             self.facts.facts = []
@@ -224,7 +232,6 @@ class CaptureSection(Section):
                 each.disabled = True
             self.counts.source("window").data = {"left": [], "right": []}
             self.counts.source("suggested").data = {"x": [], "y": []}
-        self.report_error(error)
 
     def _draw(self) -> None:
         answer, report = self._reported, self.report

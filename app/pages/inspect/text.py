@@ -488,7 +488,8 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
     per = f"in {report.flux_unit}, with 95 % interval."
     signal = PER_PIXEL if n_pulses is None else PER_PULSE
     of_targets = "Mean of the target pixels, those with an echo"
-    of_all = "Mean of all pixels; those without an echo have no signal"
+    all_pixels = "Mean of all pixels but hot and dead ones"
+    of_all = f"{all_pixels}; those without an echo have no signal"
     hot, dead = ("–" if n is None else count(n) for n in (report.n_hot, report.n_dead))
     return [
         ("Pixels", f"{rows} × {cols}", "Rows and columns."),
@@ -498,7 +499,7 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
         ("SBR, target pixels", interval(target.sbr), f"{of_targets}: signal over background."),
         (f"{signal}, all pixels", interval(image.signal), f"{of_all}: signal flux {per}"),
         ("SBR, all pixels", interval(image.sbr), f"{of_all}: signal over background."),
-        ("Background", interval(image.background), f"Mean of all pixels over the gate, {per}"),
+        ("Background", interval(image.background), f"{all_pixels}, over the gate, {per}"),
         *_stated_facts(report),
         *_reported_check_facts(answer),
         ("Hot pixels", hot, "Pixels with more detections than all neighbours, and not in an echo."),

@@ -147,7 +147,7 @@ def _recommended(goal: str, found: Recommendation | None, keeps: str) -> str:
         names = "; ".join(
             f"{name_of(other.candidate)} ({100 * share:.0f} %)" for other, share in found.runners_up
         )
-        sentence += f" Not significantly worse: {names}."
+        sentence += f" Selected instead: {names}."
     return sentence
 
 

@@ -85,8 +85,8 @@ class Recommendation:
     keeps : float
         Share of the draws in which it satisfies the limit (time or restoration degree).
     runners_up : tuple of (Point, float)
-        Points that cannot be distinguished from it, each with the share of the draws in which it
-        is chosen instead, in falling order.
+        Points that are chosen instead in `MIN_SHARE` of the draws or more, each with its share, in
+        falling order.
     optimism : float
         Mean over the draws by which the restoration degree of what is chosen exceeds that over all
         seeds: about as much too high is that of `point` on the seeds from which it was chosen
