@@ -267,7 +267,9 @@ def _estimated(
         background_shape=shape,
         is_in_proportion=in_proportion,
     )
-    start, squared = found, float((found.brightness(totals)[0] ** 2).mean())
+    start, squared = found, 1.0
+    if in_proportion:
+        squared = float((np.maximum(total / total.mean(), LEAST_BRIGHTNESS) ** 2).mean())
     for some in (_sampled(total.size, SAMPLE // 4), pixels):
         flux = _model_of_pixels(capture, found, some, least)
         evidence = level_evidence(prepare(capture, flat[np.newaxis, some], flux, 1))

@@ -154,13 +154,11 @@ class FluxPrior(NamedTuple):
         return _ones_unless(self.background_shape, self.depth)
 
     def brightness(self, totals: Totals) -> Floats:
-        """Return the signals of pixels relative to `levels`, shape (level, row, col).
+        """Return signals in proportion to backgrounds relative to `levels`, (level, row, col).
 
         At least `LEAST_BRIGHTNESS`.
         """
         levels = self.levels[:, np.newaxis, np.newaxis]
-        if not self.is_in_proportion:
-            return np.ones((levels.size, *totals.rate.shape))
         of_mean_pixel = np.maximum(self.background, 0.0) + levels * totals.has_signal
         return np.maximum(totals.rate / np.maximum(of_mean_pixel, _TINY), LEAST_BRIGHTNESS)
 

@@ -168,8 +168,9 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     known = _in_strong_sun(ordinary) if has_own_backgrounds else None
     if at_background is not None:
         # The likelihood tells signals relative to backgrounds; both add up to the total.
+        brightness = mixture.brightness_of_targets
         sbr, of_target = (
-            product_of(each.signal.scaled(1 / at_background), mixture.brightness_of_targets)
+            product_of(each.signal.scaled(1 / at_background), brightness)
             for each in (mixture.image, mixture.target)
         )
         background = known or (total and _below_signal(total, sbr)) or model.background
