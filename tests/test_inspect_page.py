@@ -797,6 +797,7 @@ def test_the_report_on_another_file_or_scene_is_not_shown(capture, near):
     near.tasks.run_until(lambda: near.answer.request.source is near.sources["wall"])
     assert capture.report is None and capture.facts.facts == []
     assert capture.counts.source("window").data["left"] == []
+    assert all(each.disabled for each in capture.apply)
     near.tasks.run_until(lambda: capture.facts.facts)
     assert capture.flux.text
 

@@ -117,7 +117,7 @@ class CaptureSection(Section):
         # The estimate may be that of an earlier setting.
         self.pulses.value = self.session.state.reduction.pulses
         shown = self._reported
-        if shown is not None and answer.request.source is not shown.request.source:
+        if shown is None or answer.request.source is not shown.request.source:
             self._clear()
         if shown is None or answer.capture is not shown.capture:
             self.flux.text = COMPUTING
