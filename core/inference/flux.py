@@ -543,8 +543,8 @@ def _totals(capture: Capture) -> _Totals:
         some = capture.counts > n_pulses - _MARGIN * _TOO_FEW
         background, most = _background_of(capture.cube[some], n_pulses), np.sqrt(variance[some])
         most = background + _CLEARLY_MORE * most
-        # Few pulses tell the background badly: it is shrunk to the median as far as chance explains
-        # how many pulses of the pixels do not fire.
+        # Few pulses leave the background uncertain: it is shrunk to the median as far as chance
+        # explains how many pulses of the pixels do not fire.
         chance = float((unfired * (n_pulses - unfired)).mean()) / n_pulses
         middle = float(np.median(background))
         shrunk = middle + _own_weight(unfired, chance) * (background - middle)

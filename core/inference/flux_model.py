@@ -29,8 +29,8 @@ UNRELATED = Agreement(0.0, 0.0, 1.0)
 _TINY = 1e-100  # photons, instead of none
 
 LEAST_BRIGHTNESS = 0.25
-"""Of dark pixels, relative to the mean: with less, no count would speak against an echo where there
-is no surface, as in the sky."""
+"""Brightness of dark pixels, relative to the mean: with less, no count would speak against an echo
+where there is no surface, as in the sky."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,9 @@ shape, and profile likelihood intervals as for a single pixel (`core.inspection.
 Where pixels differ in their backgrounds, the likelihood only gives the signal; the mean background
 is what it leaves of the total. Where signals are in proportion to the backgrounds
 (`core.inference.flux`), the likelihood gives the ratio of both, which is multiplied by the
-brightness of the pixels that have an echo; both add up to the total.
+brightness of the pixels that have an echo; both add up to the total. The share of pixels with an
+echo does not depend on their background: beside a sky that is much brighter than the targets, too
+many pixels seem to have an echo, and signals are too high.
 
 The maximum-likelihood gamma distribution has the mean of the observed signals, whatever their
 true distribution, so that the model need not be exact where signals are clear.
@@ -167,7 +169,7 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     has_own_backgrounds, at_background = mixture.has_own_backgrounds, mixture.at_background
     known = _in_strong_sun(ordinary) if has_own_backgrounds else None
     if at_background is not None:
-        # The likelihood tells signals relative to backgrounds; both add up to the total.
+        # The likelihood gives signals relative to backgrounds; both add up to the total.
         brightness = mixture.brightness_of_targets
         sbr, of_target = (
             product_of(each.signal.scaled(1 / at_background), brightness)
