@@ -323,8 +323,8 @@ def _unresolved(capture: Capture) -> FluxEstimate:
 def _dimmer(capture: Capture) -> tuple[Capture, float]:
     """Reduce the pulses of a capture whose echoes are brighter than the mean requires."""
     known = detailed_flux_prior_of(capture)
-    strongest = float(flux_model_with(capture, known).signal[-1].max())
-    share = _BRIGHT / max(strongest * (capture.gated_pulses or 1), _BRIGHT)
+    strongest = flux_model_with(capture, known._replace(levels=known.levels[-1:])).signal.max()
+    share = _BRIGHT / max(float(strongest) * (capture.gated_pulses or 1), _BRIGHT)
     return (share_of_pulses(capture, share), share) if share < 1 else (capture, 1.0)
 
 

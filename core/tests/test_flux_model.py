@@ -250,7 +250,8 @@ def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
 
 @pytest.mark.compiled
 @pytest.mark.parametrize(
-    ("signal", "background", "n_pulses"), [(0.6, 0.3, 20), (0.3, 1.0, 20), (0.6, 0.3, 10)]
+    ("signal", "background", "n_pulses"),
+    [(0.6, 0.3, 20), (0.3, 0.7, 20), (0.3, 1.0, 20), (0.6, 0.3, 10)],
 )
 def test_few_pulses_are_not_taken_for_a_strong_background(
     signal: float, background: float, n_pulses: int

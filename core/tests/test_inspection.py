@@ -23,7 +23,12 @@ from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.geometry import Box
 from core.inference import TOLERANCE_BINS, flux_prior_of
-from core.inference.faults import outlier_pixels, pixel_verdict, probability_of_fewer
+from core.inference.faults import (
+    ordinary_pixels,
+    outlier_pixels,
+    pixel_verdict,
+    probability_of_fewer,
+)
 from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.maps import likeliest
@@ -785,7 +790,26 @@ def test_mean_signals_are_right_whether_or_not_they_vary_with_the_background(reg
         signals.append(inspection.estimate_target_flux(captures[-1]).signal.value / truth[1][0])
         if regime == -2:
             assert not flux_prior_of(captures[-1]).is_in_proportion
+    # Four standard deviations of the mean; that of a capture is 0.02.
     assert np.mean(signals) == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.compiled
+def test_pixels_without_an_echo_may_be_darker_than_those_with_one() -> None:
+    """Signals relative to the mean background of all pixels would be a quarter too small."""
+    rng, shape, acquisition = np.random.default_rng(0), (40, 40), Acquisition(n_pulses=1000)
+    reflectivity, onset = rng.gamma(4, 1 / 4, shape), rng.uniform(28, 63, shape)
+    onset[:16] = np.nan
+    signal = np.where(np.isfinite(onset), 0.12 * reflectivity, 0.0)
+    background = np.where(np.isfinite(onset), 2 * reflectivity, 0.5)
+    rate = rate_per_bin(onset, signal, 0.0, Pulse(), acquisition)
+    rate += background[..., np.newaxis] / acquisition.n_bins
+    capture = Capture(draw_counts(rate, acquisition.n_pulses, rng), acquisition)
+    assert flux_prior_of(capture).is_in_proportion
+    found = mean_flux_of(capture).image
+    kept = ordinary_pixels(capture)
+    assert covers(found.signal, signal[kept].mean())
+    assert covers(found.sbr, signal[kept].mean() / background[kept].mean())
 
 
 def test_the_search_for_fluxes_ends_around_their_peak() -> None:
